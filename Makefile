@@ -47,7 +47,7 @@ $(READY): envs/requirements.lock pyproject.toml
 first-run: first-city first-labels
 
 first-labels:
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -q -p no:cacheprovider tests/unit/disparity/test_project.py -k same_in_any_order
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -q -p no:cacheprovider tests/unit/labels/test_project.py -k same_in_any_order
 
 first-city:
 	rm -rf .venv/first && PATH="$(CURDIR)/$(BIN):$$PATH" && stereotruth init .venv/first --example demo && \
@@ -75,7 +75,7 @@ networks: $(READY)
 	$(PIP) install --no-build-isolation -e '.[networks]'
 
 test-networks: networks
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/matching/networks tests/workflow/test_train.py
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/methods/networks tests/workflow/test_train.py
 
 test-s3: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest tests/workflow/test_object_storage.py

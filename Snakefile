@@ -4,8 +4,8 @@ from pathlib import Path
 
 from snakemake.utils import min_version
 
-from stereotruth.errors import InputError, in_words
-from stereotruth.project import read_mapping
+from stereotruth.core.errors import InputError, in_words
+from stereotruth.project.project import read_mapping
 
 min_version("9.10")
 # Parallelism belongs to Dask and Snakemake: threads of linear algebra that wait for a core in use

@@ -1,4 +1,4 @@
-"""Puts the workflow into the wheel, where :data:`stereotruth.project.FILES` finds it.
+"""Puts the workflow into the wheel, where :data:`stereotruth.project.project.FILES` finds it.
 
 In a clone, and in an editable installation, it stays at the top.
 """

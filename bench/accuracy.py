@@ -19,25 +19,25 @@ from drawn_scenes import DENSITIES, NAMED, add_place, compare_drawn, compare_twi
 from figures import draw_panels, evaluate_checkpoints, geometry_errors, print_records
 from synthetic_pairs import label_by, labels_of
 
-from stereotruth import sheets
-from stereotruth.alignment.align import align
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.config.configuration import Configuration
-from stereotruth.config.section import merged
-from stereotruth.dataset import warped_tile
-from stereotruth.dataset.manifest import labelled_tiles
+from stereocities.cities import CITIES
+from stereotruth.align.align import align
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.core import sheets
+from stereotruth.core.config.configuration import Configuration
+from stereotruth.core.config.section import merged
+from stereotruth.core.errors import InputError
+from stereotruth.core.numerics.error_sums import LIMITS, ErrorSum
+from stereotruth.core.products.files import read_table
+from stereotruth.core.products.grids import require_complete
+from stereotruth.core.status import carries_label
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.errors import InputError
-from stereotruth.evaluation import labels_against_truth
-from stereotruth.evaluation.epipolar_truth import write_grid_truth
-from stereotruth.evaluation.scene_warping import warp_scene
-from stereotruth.numerics.error_sums import LIMITS, ErrorSum
-from stereotruth.products.files import read_table
-from stereotruth.products.grids import require_complete
-from stereotruth.project import read_mapping
-from stereotruth.simulate.cities import CITIES
-from stereotruth.status import carries_label
+from stereotruth.evaluate import labels_against_truth
+from stereotruth.evaluate.epipolar_truth import write_grid_truth
+from stereotruth.evaluate.scene_warping import warp_scene
+from stereotruth.project.project import read_mapping
+from stereotruth.tiles import warped_tile
+from stereotruth.tiles.manifest import labelled_tiles
 
 PROJECT = Path(__file__).resolve().parents[1]
 GOALS = (  # measure of exported tiles: key of a row, lowest, highest, factor to its unit

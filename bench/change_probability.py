@@ -3,7 +3,7 @@
 python bench/change_probability.py [--fit] [--seeds 61 62] [--folder FOLDER] [--real ../shared/real]
 
 Of the simulated cities of changes.py, whose images are of one day or a year apart: the share of
-labels that have changed by the probability that stereotruth.disparity.change_probability tells.
+labels that have changed by the probability that stereotruth.labels.change_probability tells.
 With --fit the trees are first fitted anew, and written beside that module (pip install
 scikit-learn): to simulated cities, to made fields, and to changes planted in real scenes, where
 the folder of these is. Draws stay in the folder: delete it when the evidence has changed.
@@ -36,8 +36,13 @@ from numpy.typing import NDArray
 from planted_changes import GROUND, KINDS, ROOF, Planted, RealScene
 from real import Pair, Site
 
-from stereotruth.disparity.change_evidence import Evidence, LabelledWindow, change_evidence
-from stereotruth.disparity.change_probability import (
+from stereocities.changes import REASONS, TEXTURE
+from stereotruth.core.numerics.decision_trees import LEAF, DecisionTrees
+from stereotruth.core.products.files import atomic_file
+from stereotruth.core.status import is_labelled
+from stereotruth.epipolar.image_noise import EQUAL
+from stereotruth.labels.change_evidence import Evidence, LabelledWindow, change_evidence
+from stereotruth.labels.change_probability import (
     CHANGED,
     TREES,
     UNCHANGED,
@@ -46,17 +51,12 @@ from stereotruth.disparity.change_probability import (
     trees,
     with_surroundings,
 )
-from stereotruth.disparity.crowns import with_crowns
-from stereotruth.disparity.image_agreement import least_probability
-from stereotruth.disparity.learned_evidence import LEARNED, learned
-from stereotruth.disparity.recipe import lidar_labels
-from stereotruth.disparity.window_points import read_window
-from stereotruth.epipolar.image_noise import EQUAL
+from stereotruth.labels.crowns import with_crowns
+from stereotruth.labels.image_agreement import least_probability
+from stereotruth.labels.learned_evidence import LEARNED, learned
+from stereotruth.labels.recipe import lidar_labels
+from stereotruth.labels.window_points import read_window
 from stereotruth.lidar.point_store import WATER_CLASS
-from stereotruth.numerics.decision_trees import LEAF, DecisionTrees
-from stereotruth.products.files import atomic_file
-from stereotruth.simulate.changes import REASONS, TEXTURE
-from stereotruth.status import is_labelled
 
 Bools = NDArray[np.bool_]
 Singles = NDArray[np.float32]

@@ -22,26 +22,20 @@ from drawn_scenes import Place, add_place, place_given
 from numpy.typing import NDArray
 from synthetic_pairs import VIEWS, change_images, fly, gain, noise, rectify_by
 
-from stereotruth.alignment.align import align
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.scene_inputs import SceneInputs
+from stereocities.changes import REASONS, changes_at
+from stereocities.cities import Canopy, CitySpec, Dates, ViewSpec, training_city
+from stereocities.control_points import simulate_points
+from stereocities.render import simulate_image
+from stereocities.surfaces import TREE, WATER
+from stereotruth.align.align import align
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.products.files import atomic_folder
+from stereotruth.core.products.grids import require_complete
+from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.evaluation.epipolar_truth import truth_window
-from stereotruth.products.files import atomic_folder
-from stereotruth.products.grids import require_complete
-from stereotruth.simulate.changes import REASONS, changes_at
-from stereotruth.simulate.cities import (
-    Canopy,
-    CitySpec,
-    Dates,
-    ViewSpec,
-    training_city,
-)
-from stereotruth.simulate.control_points import simulate_points
-from stereotruth.simulate.render import simulate_image
-from stereotruth.simulate.surfaces import TREE, WATER
-from stereotruth.status import Status, is_labelled
+from stereotruth.evaluate.epipolar_truth import truth_window
+from stereotruth.labels.project import project_scene
+from stereotruth.labels.scene_inputs import SceneInputs
 
 FIRST_CITY = 4000  # of the numbers of cities
 SIDE_PX = 800

@@ -27,29 +27,22 @@ from synthetic_pairs import (
     sun_an_hour_later,
 )
 
-from stereotruth.alignment.adjustment import epipolar_model
-from stereotruth.alignment.align import align, from_rpcs
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.refine import refine
-from stereotruth.config.labels import LabelSettings
-from stereotruth.evaluation.epipolar_truth import write_grid_truth
-from stereotruth.evaluation.labels_against_truth import SceneComparison, compare_scene
-from stereotruth.numerics.error_sums import ErrorSum
-from stereotruth.products.files import atomic_folder
-from stereotruth.products.provenance import source_digest
-from stereotruth.simulate.cities import (
-    Canopy,
-    CitySpec,
-    Jitter,
-    SceneSpec,
-    ViewSpec,
-    training_city,
-)
-from stereotruth.simulate.control_points import simulate_points
-from stereotruth.simulate.render import simulate_image
-from stereotruth.simulate.surfaces import TREE
-from stereotruth.simulate.truth import SURFACES, truth_at
-from stereotruth.simulate.twin_world import twin_city
+from stereocities.cities import Canopy, CitySpec, Jitter, SceneSpec, ViewSpec, training_city
+from stereocities.control_points import simulate_points
+from stereocities.render import simulate_image
+from stereocities.surfaces import TREE
+from stereocities.truth import SURFACES, truth_at
+from stereocities.twin_world import twin_city
+from stereotruth.align.adjustment import epipolar_model
+from stereotruth.align.align import align, from_rpcs
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.refine import refine
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.numerics.error_sums import ErrorSum
+from stereotruth.core.products.files import atomic_folder
+from stereotruth.core.products.provenance import source_digest
+from stereotruth.evaluate.epipolar_truth import write_grid_truth
+from stereotruth.evaluate.labels_against_truth import SceneComparison, compare_scene
 
 Floats = NDArray[np.float64]
 STEP_PX = 8.0  # between the places where an alignment is examined
@@ -413,7 +406,7 @@ def _compared(
 ) -> Compared:
     """Labels and alignment of a scene, made once in a folder that has its ``key``."""
     alone = scene.align(GCPS)
-    code = source_digest("alignment.refine", "disparity.project")[:8]
+    code = source_digest("stereotruth.align.refine", "stereotruth.labels.project")[:8]
     made = COMPARED / f"{key}-{code}"
     if not made.is_dir():
         with atomic_folder(made) as scratch:

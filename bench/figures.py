@@ -22,16 +22,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from synthetic_pairs import Block
 
-from stereotruth.alignment.control_points import ControlPoints, read_gcps
-from stereotruth.dataset.warped_tile import WarpedTile
+from stereotruth.align.control_points import ControlPoints, read_gcps
+from stereotruth.core.numerics.error_sums import LIMITS, ErrorSum
+from stereotruth.core.numerics.robust import median_and_nmad
+from stereotruth.core.products.files import atomic_file
+from stereotruth.core.products.grids import blocks, require_complete
+from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.evaluation.labels_against_truth import CLASSES, WATER
-from stereotruth.numerics.error_sums import LIMITS, ErrorSum
-from stereotruth.numerics.robust import median_and_nmad
+from stereotruth.evaluate.labels_against_truth import CLASSES, WATER
 from stereotruth.pages.pictures import DIFFERENCES, DISPARITIES, NO_VALUE
-from stereotruth.products.files import atomic_file
-from stereotruth.products.grids import blocks, require_complete
-from stereotruth.status import Status, is_labelled
+from stereotruth.tiles.warped_tile import WarpedTile
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -19,19 +19,19 @@ import rasterio
 from figures import print_records
 from rasterio.transform import RPCTransformer
 
-from stereotruth.disparity.image_patches import read_patch
-from stereotruth.disparity.paper_correlation import correlate
-from stereotruth.disparity.pixel_points import Collection
-from stereotruth.epipolar.image_reader import Source
+from stereocities.cities import CITIES
+from stereotruth.core.products.grids import Layer, require_complete
+from stereotruth.core.products.resumable_grids import resumable_grid
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify_image
-from stereotruth.epipolar.rpc import SensorModel
-from stereotruth.epipolar.rpc_files import read_rpc
+from stereotruth.labels.image_patches import read_patch
+from stereotruth.labels.paper_correlation import correlate
+from stereotruth.labels.pixel_points import Collection
 from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.smooth_maps import PatchedTransform
-from stereotruth.products.grids import Layer, require_complete
-from stereotruth.products.resumable_grids import resumable_grid
-from stereotruth.simulate.cities import CITIES
+from stereotruth.sensor.image_reader import Source
+from stereotruth.sensor.rpc import SensorModel
+from stereotruth.sensor.rpc_files import read_rpc
 
 CITY = "Qichun"
 BLOCK = 1 << 16

@@ -32,29 +32,22 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from synthetic_pairs import SEED, VIEWS, fly, label_by
 
-from stereotruth.alignment.align import align
-from stereotruth.alignment.refine import refine
-from stereotruth.command.example_city import DEMO
-from stereotruth.config.labels import LabelSettings
+from stereocities.__main__ import make_scene
+from stereocities.cities import CitySpec, FlightStrip, Jitter, SceneSpec, ViewSpec, training_city
+from stereocities.control_points import simulate_points
+from stereocities.render import simulate_image
+from stereotruth.align.align import align
+from stereotruth.align.refine import refine
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.numerics.degrees import metres_per_degree
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.evaluation.epipolar_truth import write_grid_truth
+from stereotruth.evaluate.epipolar_truth import write_grid_truth
 from stereotruth.lidar.frames import Epoch, Epochs
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
 from stereotruth.lidar.strip_moves import move_strips
 from stereotruth.lidar.to_wgs84 import to_wgs84
-from stereotruth.numerics.degrees import metres_per_degree
-from stereotruth.simulate.__main__ import make_scene
-from stereotruth.simulate.cities import (
-    CitySpec,
-    FlightStrip,
-    Jitter,
-    SceneSpec,
-    ViewSpec,
-    training_city,
-)
-from stereotruth.simulate.control_points import simulate_points
-from stereotruth.simulate.render import simulate_image
+from stereotruth.project.example_city import DEMO
 
 OFFSETS_M = (0.31, 0.0, 0.07), (-0.2, 0.25, -0.06), (0.1, -0.33, 0.09), (-0.25, -0.15, -0.08)
 DENSITIES = 10.6, 2.6, 5.0, 4.0  # points/m²

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.image_patches import read_patch
-from stereotruth.disparity.pair_window import PairWindow
-from stereotruth.disparity.pixel_labels import Labels
-from stereotruth.disparity.scene_inputs import SceneInputs
 from stereotruth.epipolar.image_noise import NoiseCurve, pair_noise
+from stereotruth.labels.change_evidence import LabelledWindow
+from stereotruth.labels.image_patches import read_patch
+from stereotruth.labels.pair_window import PairWindow
+from stereotruth.labels.pixel_labels import Labels
+from stereotruth.labels.scene_inputs import SceneInputs
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

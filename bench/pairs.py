@@ -21,20 +21,20 @@ import numpy as np
 from scipy.stats import spearmanr
 from synthetic_pairs import fly
 
+from stereobench.methods.sgm import SemiGlobalMatcher
+from stereocities.rpcs import draw_bias
+from stereocities.site_images import pair_truth, simulate_site_image
+from stereocities.sites import SiteSpec, drawn_site
+from stereotruth.core.products.grids import open_grid
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.image_reader import open_pair
-from stereotruth.epipolar.pair_quality import USUAL_ROUGHNESS_M, quality_of
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.epipolar.rpc import SensorModel
-from stereotruth.epipolar.rpc_files import read_rpc
-from stereotruth.epipolar.site_pairs import SiteImage, SitePair, pairs_of_site
 from stereotruth.lidar.point_store import open_stores
 from stereotruth.lidar.roughness import roughness_m
-from stereotruth.matching.sgm import SemiGlobalMatcher
-from stereotruth.products.grids import open_grid
-from stereotruth.simulate.rpcs import draw_bias
-from stereotruth.simulate.site_images import pair_truth, simulate_site_image
-from stereotruth.simulate.sites import SiteSpec, drawn_site
+from stereotruth.sensor.image_reader import open_pair
+from stereotruth.sensor.pair_quality import USUAL_ROUGHNESS_M, quality_of
+from stereotruth.sensor.rpc import SensorModel
+from stereotruth.sensor.rpc_files import read_rpc
+from stereotruth.sensor.site_pairs import SiteImage, SitePair, pairs_of_site
 
 SEED = 2026
 SPACING_M = 0.5  # of the LiDAR's points

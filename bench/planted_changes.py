@@ -30,20 +30,20 @@ from scipy.ndimage import (
     uniform_filter,
 )
 
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.change_evidence import LabelledWindow
-from stereotruth.disparity.change_probability import change_probability
-from stereotruth.disparity.crowns import with_crowns
-from stereotruth.disparity.image_agreement import least_probability
-from stereotruth.disparity.pair_window import PairWindow, WindowLabels
-from stereotruth.disparity.recipe import lidar_labels
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.window_points import read_window
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.products.files import atomic_folder
+from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.image_noise import EQUAL
+from stereotruth.labels.change_evidence import LabelledWindow
+from stereotruth.labels.change_probability import change_probability
+from stereotruth.labels.crowns import with_crowns
+from stereotruth.labels.image_agreement import least_probability
+from stereotruth.labels.pair_window import PairWindow, WindowLabels
+from stereotruth.labels.recipe import lidar_labels
+from stereotruth.labels.scene_inputs import SceneInputs
+from stereotruth.labels.window_points import read_window
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import WATER_CLASS
-from stereotruth.products.files import atomic_folder
-from stereotruth.status import Status, is_labelled
 from stereotruth.surface.make_surface import make_surface
 
 Floats = NDArray[np.float64]

@@ -29,21 +29,21 @@ import yaml
 from figures import check_point_errors, draw_panels, print_records
 from numpy.typing import NDArray
 
-from stereotruth.alignment.control_points import ControlPoints
-from stereotruth.config.labels import LabelSettings
-from stereotruth.dataset.sift_matches import match_tile
-from stereotruth.dataset.warped_tile import WarpedTile
-from stereotruth.disparity.recipe import lidar_labels
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.disparity.window_points import read_window
+from stereotruth.align.control_points import ControlPoints
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.numerics.degrees import metres_per_degree
+from stereotruth.core.products.grids import require_complete
+from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.intersection import intersect
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.epipolar.rpc import RPC, SensorModel
 from stereotruth.epipolar.warping import warp_rows
-from stereotruth.evaluation.scene_warping import warp_scene
-from stereotruth.numerics.degrees import metres_per_degree
-from stereotruth.products.grids import require_complete
-from stereotruth.status import Status, is_labelled
+from stereotruth.evaluate.scene_warping import warp_scene
+from stereotruth.labels.recipe import lidar_labels
+from stereotruth.labels.scene_inputs import SceneInputs
+from stereotruth.labels.window_points import read_window
+from stereotruth.sensor.rpc import RPC, SensorModel
+from stereotruth.tiles.sift_matches import match_tile
+from stereotruth.tiles.warped_tile import WarpedTile
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

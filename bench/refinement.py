@@ -26,19 +26,19 @@ from figures import OFF_PX, percent, print_table
 from numpy.typing import NDArray
 from synthetic_pairs import Block, rectify_by
 
-from stereotruth.alignment.adjustment import epipolar_model
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.label_uncertainty import label_covariance
-from stereotruth.alignment.refine import refine
+from stereocities.render import prepare
+from stereocities.surfaces import GROUND, TREE, terrain_heights
+from stereocities.truth import truth_at
+from stereotruth.align.adjustment import epipolar_model
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.label_uncertainty import label_covariance
+from stereotruth.align.refine import refine
+from stereotruth.core.errors import InputError
+from stereotruth.core.products.files import atomic_file, atomic_folder
+from stereotruth.core.products.provenance import source_digest
+from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.errors import InputError
-from stereotruth.evaluation.labels_against_truth import CLASSES, WATER
-from stereotruth.products.files import atomic_file, atomic_folder
-from stereotruth.products.provenance import source_digest
-from stereotruth.simulate.render import prepare
-from stereotruth.simulate.surfaces import GROUND, TREE, terrain_heights
-from stereotruth.simulate.truth import truth_at
-from stereotruth.status import Status, is_labelled
+from stereotruth.evaluate.labels_against_truth import CLASSES, WATER
 
 SEEDS = {
     "accuracy": 2700,
@@ -353,9 +353,9 @@ def trial(draw: Draw, gcps: int, with_labels: bool, folder: Path) -> Row:
 
 def rows_of(options: argparse.Namespace) -> Iterator[Row]:
     """All rows: those of an earlier run by the same code are read, the others made."""
-    code = source_digest("alignment.align", "alignment.refine")[:8]
+    code = source_digest("stereotruth.align.align", "stereotruth.align.refine")[:8]
     if options.labels:
-        code = source_digest("alignment.refine", "disparity.project")[:8]
+        code = source_digest("stereotruth.align.refine", "stereotruth.labels.project")[:8]
     draws = list(DRAWS[options.what](options.scenes))
     for number, (draw, gcps) in enumerate(draws):
         name = f"{draw.key()}-{gcps}-{code}.json"

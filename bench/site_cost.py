@@ -22,9 +22,9 @@ from typing import NamedTuple
 from kernel_rates import fastest
 from throughput import decode
 
-from stereotruth.command import example_city
-from stereotruth.command.new_project import begin
-from stereotruth.simulate.sites import drawn_site
+from stereocities.sites import drawn_site
+from stereotruth.project.new_project import begin
+from stereotruth.project.project import example_city
 
 RULES = (
     "ingest", "compare_strips", "surface", "align", "refine", "adjust", "adjusted_alignment",

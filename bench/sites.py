@@ -24,33 +24,33 @@ import numpy as np
 from figures import print_table
 from synthetic_pairs import VIEWS, far_apart, fly, rectify_by
 
-from stereotruth.alignment.adjustment import epipolar_model
-from stereotruth.alignment.align import align, from_rpcs
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.gcp_checks import open_view
-from stereotruth.alignment.refine import refine
-from stereotruth.alignment.site_adjustment import adjust_site
-from stereotruth.alignment.site_pair import ScenePair, pair_alignment
-from stereotruth.alignment.tie_equations import write_equations
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.epipolar.pair_quality import quality_of
-from stereotruth.epipolar.rpc import SensorModel
-from stereotruth.epipolar.shown_ground import GroundOfImages
-from stereotruth.epipolar.site_pairs import SiteImage, SitePair, pairs_of_site
-from stereotruth.errors import InputError
-from stereotruth.evaluation.closure import PairFiles, closure_of_labels, figures, triplets_of
-from stereotruth.lidar.point_store import open_stores
-from stereotruth.products.files import atomic_folder, write_table
-from stereotruth.products.provenance import source_digest
-from stereotruth.simulate.site_images import (
+from stereocities.site_images import (
     image_truth,
     pair_truth,
     simulate_site_image,
     simulate_site_points,
 )
-from stereotruth.simulate.sites import SiteSpec, drawn_site
+from stereocities.sites import SiteSpec, drawn_site
+from stereotruth.align.adjustment import epipolar_model
+from stereotruth.align.align import align, from_rpcs
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.gcp_checks import open_view
+from stereotruth.align.refine import refine
+from stereotruth.align.site_adjustment import adjust_site
+from stereotruth.align.site_pair import ScenePair, pair_alignment
+from stereotruth.align.tie_equations import write_equations
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.errors import InputError
+from stereotruth.core.products.files import atomic_folder, write_table
+from stereotruth.core.products.provenance import source_digest
+from stereotruth.evaluate.closure import PairFiles, closure_of_labels, figures, triplets_of
+from stereotruth.labels.project import project_scene
+from stereotruth.labels.scene_inputs import SceneInputs
+from stereotruth.lidar.point_store import open_stores
+from stereotruth.sensor.pair_quality import quality_of
+from stereotruth.sensor.rpc import SensorModel
+from stereotruth.sensor.shown_ground import GroundOfImages
+from stereotruth.sensor.site_pairs import SiteImage, SitePair, pairs_of_site
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import ground_cell
 
@@ -140,7 +140,7 @@ def refined(folder: Path, names: tuple[str, str], count: int) -> ScenePair:
     """Files of a pair, aligned and refined by itself as the workflow does for a site."""
     gcps = some_points(folder, count)
     scene = f"{names[0]}_{names[1]}"
-    made = folder / "pairs" / f"{scene}-{count}-{source_digest('alignment.refine')[:8]}"
+    made = folder / "pairs" / f"{scene}-{count}-{source_digest('stereotruth.align.refine')[:8]}"
     pair = ScenePair(scene, *names, made / "alignment.json", made / "equations.json", gcps)
     if not made.is_dir():
         files = [folder / f"{name}.tif" for name in names]
@@ -235,7 +235,7 @@ def labelled(
     folder: Path, pair: ScenePair, alignment: Alignment, surface: Path, case: str
 ) -> PairFiles:
     """Files of a pair, rectified by an alignment and labelled on the surface of its site."""
-    code = source_digest("disparity.project")
+    code = source_digest("stereotruth.labels.project")
     made = folder / "labels" / f"{pair.scene}-{case}-{code[:8]}"
     if not made.is_dir():
         images = [folder / f"{name}.tif" for name in pair.names]
@@ -262,7 +262,7 @@ def labelled(
 
 def surface_of(folder: Path, images: Sequence[Path]) -> Path:
     """The surface of a site's points, as the workflow makes it for all of its images."""
-    out = folder / f"site-{source_digest('surface.make_surface')[:8]}.surface"
+    out = folder / f"site-{source_digest('stereotruth.surface.make_surface')[:8]}.surface"
     if not out.is_dir():
         ground = GroundOfImages.open(list(images))
         stores = open_stores(sorted((folder / "points").glob("*.points")))

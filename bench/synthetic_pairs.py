@@ -18,39 +18,32 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from stereotruth.alignment.adjustment import epipolar_model
-from stereotruth.alignment.align import align
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.refine import refine
-from stereotruth.config.configuration import Configuration
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import MAX_POINTS, SHARD, project_scene
-from stereotruth.disparity.recipe import label_window
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.epipolar.image_reader import open_pair
+from stereobench.methods.image_faults import as_images, smooth
+from stereocities.cities import CITIES, CitySpec, SceneSpec, ViewSpec, lidar_files, training_city
+from stereocities.control_points import simulate_points
+from stereocities.lidar import simulate_lidar_tile
+from stereocities.render import simulate_image
+from stereotruth.align.adjustment import epipolar_model
+from stereotruth.align.align import align
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.refine import refine
+from stereotruth.core.config.configuration import Configuration
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.numerics.degrees import DEGREE_M
+from stereotruth.core.products.files import atomic_folder
+from stereotruth.core.products.provenance import source_digest
+from stereotruth.core.products.ungeoreferenced import open_raster
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.evaluation.epipolar_truth import truth_window
-from stereotruth.evaluation.labels_against_truth import Truth
+from stereotruth.evaluate.epipolar_truth import truth_window
+from stereotruth.evaluate.labels_against_truth import Truth
+from stereotruth.labels.project import MAX_POINTS, SHARD, project_scene
+from stereotruth.labels.recipe import label_window
+from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
-from stereotruth.matching.image_faults import as_images, smooth
-from stereotruth.numerics.degrees import DEGREE_M
-from stereotruth.products.files import atomic_folder
-from stereotruth.products.provenance import source_digest
-from stereotruth.products.ungeoreferenced import open_raster
-from stereotruth.simulate.cities import (
-    CITIES,
-    CitySpec,
-    SceneSpec,
-    ViewSpec,
-    lidar_files,
-    training_city,
-)
-from stereotruth.simulate.control_points import simulate_points
-from stereotruth.simulate.lidar import simulate_lidar_tile
-from stereotruth.simulate.render import simulate_image
+from stereotruth.sensor.image_reader import open_pair
 
 VIEWS = ("left", "right")
 SEED = 12  # of the fresh cities, their control points' noise and the faults of images
@@ -219,7 +212,7 @@ def label_by(
     rectify_by(alignment, images, folder, workers=workers)
     made = folder / "disparity.zarr"
     rectified = (folder / f"{view}.zarr" for view in VIEWS)
-    code = source_digest("disparity.project")
+    code = source_digest("stereotruth.labels.project")
     alignment_file = folder / "alignment.json"
     strips = folder / "points.strips"
     compare_strips([PointStore(path) for path in stores]).write(strips)

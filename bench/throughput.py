@@ -29,18 +29,18 @@ from figures import print_records
 from kernel_rates import CITY, fastest, kernels, show_kernels
 
 import stereotruth
-from stereotruth.alignment.adjustment import epipolar_model
-from stereotruth.alignment.align import align
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.epipolar.image_reader import open_pair
+from stereocities.cities import CITIES, lidar_files
+from stereocities.lidar import simulate_lidar_tile
+from stereocities.render import simulate_image
+from stereotruth.align.adjustment import epipolar_model
+from stereotruth.align.align import align
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.products.provenance import source_digest
 from stereotruth.epipolar.rectify import rectify
+from stereotruth.labels.project import project_scene
+from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
-from stereotruth.products.provenance import source_digest
-from stereotruth.simulate.cities import CITIES, lidar_files
-from stereotruth.simulate.lidar import simulate_lidar_tile
-from stereotruth.simulate.render import simulate_image
+from stereotruth.sensor.image_reader import open_pair
 
 PROJECT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(stereotruth.__file__).parent
@@ -48,19 +48,19 @@ SCENE = f"{CITY}-1"
 POINTS_AT_25_CM = 82.6  # million, of this scene
 INGEST_JOB = """
 import sys
-from stereotruth.job import job
+from stereotruth.core.job import job
 from stereotruth.lidar.ingest import ingest
-from stereotruth.products.provenance import describe
+from stereotruth.core.products.provenance import describe
 lidar, store, log = sys.argv[1:]
 with job(log, "ingest"):
     ingest(lidar, store, provenance=describe([lidar], {}, ""))
 """
 PROJECT_JOB = """
 import json, os, sys
-from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.config.labels import LabelSettings
-from stereotruth.job import job
+from stereotruth.labels.project import project_scene
+from stereotruth.labels.scene_inputs import SceneInputs
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.job import job
 left, right, points, out, log, alignment, settings, options = sys.argv[1:]
 points, settings = json.loads(points), LabelSettings(**json.loads(settings))
 inputs = SceneInputs.of(left, right, points, settings, alignment=alignment)
@@ -227,7 +227,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     print("compiling", flush=True)
     ingest_all([smallest], folder / "points", 1, env)
     smallest_store = folder / "points" / f"{smallest.stem}.points"
-    code = source_digest("disparity.project")
+    code = source_digest("stereotruth.labels.project")
     alignment, options = folder / "alignment.json", {"code": code}
 
     def inputs(points: Sequence[Path]) -> SceneInputs:
@@ -264,7 +264,7 @@ def chain(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         ):
             clock, used = fastest(call, 1)
             seconds[name], cpu[name] = min(seconds[name], clock), min(cpu[name], used)
-    start = "import stereotruth.lidar.ingest, stereotruth.job"
+    start = "import stereotruth.lidar.ingest, stereotruth.core.job"
     _, start_up = fastest(lambda: job(start, env=env), 3)
     total = seconds["ingest"] + seconds["project"]
     profiles = {}

@@ -12,7 +12,7 @@ from sphinx.util import logging
 from typer.cli import get_docs_for_click
 
 from stereotruth import __version__
-from stereotruth.command.main import app as command
+from stereotruth.project.main import app as command
 
 LOG = logging.getLogger(__name__)
 DOCS = Path(__file__).parent

@@ -38,7 +38,7 @@ class Telling(WorkerPlugin):
         self.file = file
 
     def setup(self, worker: object) -> None:
-        from stereotruth.products.resumable_grids import BlockStore
+        from stereotruth.core.products.resumable_grids import BlockStore
 
         job, file = os.environ["SLURM_JOB_ID"], self.file
         has, write = BlockStore.has, BlockStore.write

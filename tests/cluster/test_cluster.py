@@ -16,10 +16,10 @@ from pathlib import Path
 
 import pytest
 
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity import project
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.simulate.__main__ import make_scene
+from stereocities.__main__ import make_scene
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.labels import project
+from stereotruth.labels.scene_inputs import SceneInputs
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 from .slurm import Job, jobs, kill_job, kill_node, start_node, wait_for

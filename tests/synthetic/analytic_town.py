@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from stereotruth.evaluation.surface_models.reference import BUILDING, GROUND, TREE
+from stereotruth.evaluate.surface_models.reference import BUILDING, GROUND, TREE
 from stereotruth.lidar.height_raster import HeightRaster
 
 from .exact_surface import write_heights

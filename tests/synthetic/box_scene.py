@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from stereotruth.alignment.aligned_pair import Alignment, ViewFit
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.scene_inputs import SceneInputs
+from stereotruth.align.aligned_pair import Alignment, ViewFit
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.products.grids import Layer, atomic_store, create_grid, open_grid
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
+from stereotruth.labels.project import project_scene
+from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
-from stereotruth.products.grids import Layer, atomic_store, create_grid, open_grid
 
 from .cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
 from .images import pattern

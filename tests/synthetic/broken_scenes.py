@@ -186,7 +186,7 @@ def _blunders(rows: list[dict]) -> None:
 
 
 def _on_a_line(rows: list[dict]) -> list[dict]:
-    from stereotruth.epipolar.rpc import SensorModel
+    from stereotruth.sensor.rpc import SensorModel
 
     for k, row in enumerate(rows):
         row["lon"], row["lat"] = LON - 0.008 + 0.001 * k, LAT

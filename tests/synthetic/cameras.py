@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from rasterio.rpc import RPC as RasterioRPC
 
-from stereotruth.epipolar.rpc import RPC, SensorModel
+from stereotruth.sensor.rpc import RPC, SensorModel
 
 
 def make_rpc(seed: int, image_offset: float = 0.0) -> RPC:

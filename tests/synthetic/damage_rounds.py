@@ -34,15 +34,15 @@ from typing import Any
 
 import numpy as np
 
-from stereotruth.alignment.align import align
-from stereotruth.alignment.align_figure import draw_residuals
-from stereotruth.alignment.align_report import write_alignment
-from stereotruth.alignment.gcp_checks import open_view
-from stereotruth.epipolar.image_reader import Source
-from stereotruth.errors import InputError
-from stereotruth.job import in_own_process
+from stereotruth.align.align import align
+from stereotruth.align.align_figure import draw_residuals
+from stereotruth.align.align_report import write_alignment
+from stereotruth.align.gcp_checks import open_view
+from stereotruth.core.errors import InputError
+from stereotruth.core.job import in_own_process
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
+from stereotruth.sensor.image_reader import Source
 
 from . import damage
 from .damaged_cases import Case, synthetic_cases

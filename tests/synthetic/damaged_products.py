@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 import yaml
 
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.config.configuration import Configuration
-from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.core.config.configuration import Configuration
+from stereotruth.core.errors import InputError
+from stereotruth.core.products.files import link, read_perhaps_edited
+from stereotruth.core.products.grids import open_grid
+from stereotruth.core.products.rasters import read_image
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.errors import InputError
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.products.files import link, read_perhaps_edited
-from stereotruth.products.grids import open_grid
-from stereotruth.products.rasters import read_image
-from stereotruth.project import lidar_of, read_scenes
+from stereotruth.project.project import lidar_of, read_scenes
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from .damaged_cases import Case
 

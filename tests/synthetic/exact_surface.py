@@ -9,10 +9,10 @@ import pyproj
 import rasterio
 from rasterio.transform import from_origin
 
-from stereotruth.simulate.built_city import top_surface
-from stereotruth.simulate.cities import CitySpec, SceneSpec
-from stereotruth.simulate.layout import half_size
-from stereotruth.simulate.surfaces import IN_LIDAR
+from stereocities.built_city import top_surface
+from stereocities.cities import CitySpec, SceneSpec
+from stereocities.layout import half_size
+from stereocities.surfaces import IN_LIDAR
 
 
 def grid_of(city: CitySpec, scene: SceneSpec, cell_m: float, inset_m: float = 10.0):

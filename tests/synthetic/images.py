@@ -9,7 +9,7 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth.epipolar.rpc import RPC
+from stereotruth.sensor.rpc import RPC
 
 from .cameras import to_rasterio
 

@@ -15,10 +15,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity import recipe
-from stereotruth.disparity.facet_labels import facet_labels
-from stereotruth.status import Status
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.status import Status
+from stereotruth.labels import recipe
+from stereotruth.labels.facet_labels import facet_labels
 
 from .box_scene import Scene
 

@@ -11,9 +11,9 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereotruth.command.example_city import DEMO
-from stereotruth.simulate.__main__ import make_scene
-from stereotruth.simulate.cities import SceneSpec
+from stereocities.__main__ import make_scene
+from stereocities.cities import SceneSpec
+from stereotruth.project.example_city import DEMO
 
 from .forked_snakemake import planner, runner, start_snakemake
 from .forks import Forker

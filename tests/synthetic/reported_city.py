@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stereotruth.products.rasters import write_tiff
+from stereotruth.core.products.rasters import write_tiff
 
 SIZE = 96
 SHIFT = 7  # px of disparity, of every tile

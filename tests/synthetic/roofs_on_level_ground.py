@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.epipolar.rpc import SensorModel
+from stereotruth.sensor.rpc import SensorModel
 
 from .cameras import HEIGHT, LAT, LON, METRES
 from .textured_pair import SIZE

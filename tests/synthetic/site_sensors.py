@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereotruth.epipolar.rpc import RPC, SensorModel
-from stereotruth.epipolar.site_pairs import SiteImage
-from stereotruth.simulate.site_images import camera_of
-from stereotruth.simulate.sites import ImageSpec, SiteSpec
+from stereocities.site_images import camera_of
+from stereocities.sites import ImageSpec, SiteSpec
+from stereotruth.sensor.rpc import RPC, SensorModel
+from stereotruth.sensor.site_pairs import SiteImage
 
 SCALES = ("line_scale", "samp_scale", "lat_scale", "long_scale", "height_scale")
 COEFFICIENTS = ("line_num_coeff", "line_den_coeff", "samp_num_coeff", "samp_den_coeff")

@@ -7,11 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereotruth.simulate.cities import (
-    Character,
-    CitySpec,
-    SceneSpec,
-)
+from stereocities.cities import Character, CitySpec, SceneSpec
 
 ROOT = Path(__file__).parents[2]
 NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)

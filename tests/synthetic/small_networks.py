@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from stereotruth.matching.networks import keras_weights
-from stereotruth.matching.networks.inference import NetworkMethod
-from stereotruth.matching.networks.weights import SavedNetwork
+from stereobench.networks import keras_weights
+from stereobench.networks.inference import NetworkMethod
+from stereobench.networks.weights import SavedNetwork
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: make test-networks")
 CPU = torch.device("cpu")

@@ -9,7 +9,7 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 SIZE, RANGE = 64, (-16, 16)
 

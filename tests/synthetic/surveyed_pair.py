@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from stereotruth.alignment.align import align
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.control_points import COLUMNS
-from stereotruth.epipolar.rpc import RPC, SensorModel
+from stereotruth.align.align import align
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.control_points import COLUMNS
+from stereotruth.sensor.rpc import RPC, SensorModel
 
 LON, LAT, HEIGHT = 115.4, 30.2, 60.0
 SIZES = {"left": (4000, 3000), "right": (3600, 2800)}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from stereotruth.disparity.image_patches import read_patch
-from stereotruth.disparity.pair_window import PairWindow
-from stereotruth.disparity.pixel_labels import Labels
+from stereotruth.labels.image_patches import read_patch
+from stereotruth.labels.pair_window import PairWindow
+from stereotruth.labels.pixel_labels import Labels
 
 ROWS, COLS = slice(20, 140), slice(60, 200)
 SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start

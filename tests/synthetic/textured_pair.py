@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereotruth.alignment.aligned_pair import Alignment, ViewFit
-from stereotruth.epipolar.rpc import SensorModel
+from stereotruth.align.aligned_pair import Alignment, ViewFit
+from stereotruth.sensor.rpc import SensorModel
 
 from .cameras import BACKWARD, FORWARD, HEIGHT, camera
 

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from stereotruth.config.labels import Export, Limits
-from stereotruth.dataset.export import City, Extras, export_city
-from stereotruth.dataset.scene_stores import SceneFiles
-from stereotruth.epipolar.colours import COLOURS
+from stereotruth.core.config.labels import Export, Limits
+from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.epipolar.rpc import RPC, SensorModel
-from stereotruth.products.grids import Layer, atomic_store, create_grid
+from stereotruth.sensor.colours import COLOURS
+from stereotruth.sensor.rpc import RPC, SensorModel
+from stereotruth.tiles.export import City, Extras, export_city
+from stereotruth.tiles.scene_stores import SceneFiles
 
 SIZE = 64
 PIXELS = 360  # side of the original images

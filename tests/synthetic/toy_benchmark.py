@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from stereotruth.matching.benchmark.score_method import ScoringPlan
+from stereobench.scores.score_method import ScoringPlan
 
 SHAPE = (24, 32)
 CITIES = {"KM": "train", "WH": "test"}  # Kunming has training tiles, Wuhan none

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import zarr
 
+from stereotruth.core.products import grids
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.epipolar.rpc import SensorModel
-from stereotruth.products import grids
+from stereotruth.sensor.rpc import SensorModel
 
 from .surveyed_pair import linear_rpc
 

@@ -50,7 +50,7 @@ class Session:
         self.place = folder
         program = folder / ".bin/stereotruth"
         program.parent.mkdir()
-        program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m stereotruth.command.main "$@"\n')
+        program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m stereotruth.project.main "$@"\n')
         program.chmod(0o755)
         paths = (program.parent, Path(sys.executable).parent, os.environ["PATH"])
         self.environment = {

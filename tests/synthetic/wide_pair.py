@@ -6,7 +6,7 @@ import numpy as np
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.epipolar.rpc import SensorModel
+from stereotruth.sensor.rpc import SensorModel
 
 from .cameras import HEIGHT, LAT, LON, METRES
 

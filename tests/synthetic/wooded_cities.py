@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereotruth.simulate.cities import Canopy, CitySpec, ViewSpec
-from stereotruth.simulate.render import prepare
-from stereotruth.simulate.truth import truth_at
+from stereocities.cities import Canopy, CitySpec, ViewSpec
+from stereocities.render import prepare
+from stereocities.truth import truth_at
 
 from .small_cities import TOWN
 

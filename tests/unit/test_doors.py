@@ -19,19 +19,19 @@ import rasterio
 from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 
-from stereotruth.alignment.control_points import read_gcps
-from stereotruth.command.import_gcps import import_gcps
-from stereotruth.epipolar.rpc import RPC
-from stereotruth.errors import InputError
-from stereotruth.evaluation.surface_models import score
-from stereotruth.evaluation.surface_models.reference import RasterReference
-from stereotruth.evaluation.surface_models.score import score_surface_model
+from stereotruth.align.control_points import read_gcps
+from stereotruth.core.errors import InputError
+from stereotruth.core.numerics.degrees import continuous
+from stereotruth.evaluate.surface_models import score
+from stereotruth.evaluate.surface_models.reference import RasterReference
+from stereotruth.evaluate.surface_models.score import score_surface_model
 from stereotruth.lidar.declared_crs import LidarCRS
 from stereotruth.lidar.geoid import GeoidGrid
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.to_wgs84 import check_area
-from stereotruth.numerics.degrees import continuous
+from stereotruth.project.import_gcps import import_gcps
+from stereotruth.sensor.rpc import RPC
 
 from ..synthetic.analytic_town import EPSG, NORTH, SIDE, WEST, Town, write
 from ..synthetic.las import FT, US_FT, everything, write_gtx, write_las

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from stereotruth.command.main import main
+from stereotruth.project.main import main
 
 from ..synthetic.project import ROOT, SIZE, Project, Run
 
-COMMAND = [sys.executable, "-m", "stereotruth.command.main"]
+COMMAND = [sys.executable, "-m", "stereotruth.project.main"]
 
 
 def call(*arguments: str, folder: Path, command: list[str] = COMMAND) -> Run:
@@ -188,7 +188,7 @@ def test_help_shows_examples(monkeypatch, capsys, words):
 
 def test_the_command_starts_quickly(tmp_path):
     """Nothing heavy is imported before a stage is asked."""
-    words = "import stereotruth.command.main, sys; print(*sys.modules)"
+    words = "import stereotruth.project.main, sys; print(*sys.modules)"
     loaded = set(call("-c", words, folder=tmp_path, command=[sys.executable]).text.split())
     assert "typer" in loaded
     assert not loaded & {"numpy", "numba", "rasterio", "snakemake", "xarray", "pydantic"}

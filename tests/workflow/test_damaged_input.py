@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereotruth.alignment.align import align
-from stereotruth.alignment.align_figure import draw_residuals
+from stereotruth.align.align import align
+from stereotruth.align.align_figure import draw_residuals
 
 from ..synthetic import damage_rounds
 from ..synthetic.damage import BYTES, TEXT, damaged

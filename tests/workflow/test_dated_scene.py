@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import zarr
 
+from stereocities.__main__ import make_scene
+from stereocities.changes import REASONS, changes_at
+from stereocities.cities import Dates
+from stereocities.surfaces import WATER
+from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.evaluation.epipolar_truth import truth_window
-from stereotruth.simulate.__main__ import make_scene
-from stereotruth.simulate.changes import REASONS, changes_at
-from stereotruth.simulate.cities import Dates
-from stereotruth.simulate.surfaces import WATER
-from stereotruth.status import Status, is_labelled
+from stereotruth.evaluate.epipolar_truth import truth_window
 
 from ..synthetic.project import SIZE, TINY, row_of
 

@@ -14,20 +14,20 @@ import rioxarray
 import xarray as xr
 import zarr
 
-from stereotruth.alignment.align import align
-from stereotruth.alignment.refine import refine
-from stereotruth.command.check import check_project
-from stereotruth.command.findings import Level
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.epipolar.image_reader import open_pair
+from stereotruth.align.align import align
+from stereotruth.align.refine import refine
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.errors import InputError
+from stereotruth.core.status import Status
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.errors import InputError
+from stereotruth.labels.project import project_scene
+from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.status import Status
+from stereotruth.project.check import check_project
+from stereotruth.project.findings import Level
+from stereotruth.sensor.image_reader import open_pair
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 
@@ -67,8 +67,8 @@ def test_tiles_are_made_with_all_their_files(made):
 
 def test_disparity_agrees_with_the_exact_truth(made, tmp_path):
     """Labelled and truly visible pixels: the limits that the project has set itself."""
-    from stereotruth.evaluation.epipolar_truth import write_grid_truth
-    from stereotruth.evaluation.labels_against_truth import compare_scene
+    from stereotruth.evaluate.epipolar_truth import write_grid_truth
+    from stereotruth.evaluate.labels_against_truth import compare_scene
 
     epipolar = made.folder / "results/rectify/Tiny/Tiny-1/epipolar.json"
     write_grid_truth(TINY, TINY.scenes[0], epipolar, tmp_path / "truth.zarr")

@@ -8,8 +8,8 @@ import time
 import pytest
 import yaml
 
-from stereotruth.errors import InputError
-from stereotruth.project import configured, lidar_of, read_scenes
+from stereotruth.core.errors import InputError
+from stereotruth.project.project import configured, lidar_of, read_scenes
 
 
 def test_a_city_is_planned_from_nothing(project):
@@ -140,7 +140,7 @@ def test_a_scene_without_gcps_is_refused_unless_it_is_refined(project):
     mine = project.add_scene("mine", [row], alignment={"refine": False})
     run = project.snakemake("--dry-run", "tiles/Mine", "--configfile", mine)
     assert run.status != 0
-    for word in ("Mine-1", "no GCPs", "alignment.refine", "Remedy"):
+    for word in ("Mine-1", "no GCPs", "stereotruth.align.refine", "Remedy"):
         assert word in run.text
     jobs = project.plan("tiles/Mine", "--configfile", project.add_scene("mine", [row]))
     assert jobs["refine"] == 1

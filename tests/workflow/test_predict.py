@@ -7,10 +7,10 @@ import json
 import numpy as np
 import rasterio
 
+from stereobench.methods.scenes.surface_model import Raster
+from stereotruth.core.products.grids import open_grid
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.evaluation.epipolar_truth import truth_window
-from stereotruth.matching.scenes.surface_model import Raster
-from stereotruth.products.grids import open_grid
+from stereotruth.evaluate.epipolar_truth import truth_window
 
 from ..synthetic.project import TINY
 

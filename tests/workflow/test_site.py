@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereotruth.command.example_city import SITE
-from stereotruth.dataset.verify import defects
+from stereocities.site_images import image_truth
+from stereotruth.core.products.grids import open_grid
 from stereotruth.lidar.catalogue_list import ListedTile, TileList, write_list
 from stereotruth.lidar.footprint import Footprint
-from stereotruth.products.grids import open_grid
-from stereotruth.simulate.site_images import image_truth
+from stereotruth.project.example_city import SITE
+from stereotruth.tiles.verify import defects
 
-COMMAND = [sys.executable, "-m", "stereotruth.command.main"]
+COMMAND = [sys.executable, "-m", "stereotruth.project.main"]
 
 
 def call(folder: Path, *arguments: str) -> str:

@@ -11,7 +11,7 @@ import pytest
 import rasterio
 import yaml
 
-from stereotruth.dataset.stereo_dataset import StereoDataset
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from ..synthetic.project import SIZE, row_of
 

@@ -26,7 +26,7 @@ rule adjust:
         fixed=lambda w: fixed_images(w),
         strict=SETTINGS.strict,
         epoch=lambda w: epoch_of(w.city),
-        code=source_digest("alignment.site_adjustment"),
+        code=source_digest("stereotruth.align.site_adjustment"),
     message:
         "Adjusting the images of {wildcards.city} together"
     script:
@@ -54,7 +54,7 @@ rule adjusted_alignment:
         sources=upstream("adjusted_alignment"),
         script=content_of("../scripts/adjusted_alignment.py"),
         images=lambda w: ADJUSTED[w.scene],
-        code=source_digest("alignment.site_pair"),
+        code=source_digest("stereotruth.align.site_pair"),
     message:
         "Alignment of scene {wildcards.scene} by its adjusted images"
     script:

@@ -20,9 +20,9 @@ rule audit:
         script=content_of("../scripts/audit.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         settings=SETTINGS.audit.model_dump(),
-        measuring=source_digest("evaluation.audit.pair", "evaluation.audit.sharing"),
-        code=source_digest("evaluation.audit.audit"),
-        templates=templates_of("evaluation", "audit", "page.html.jinja"),
+        measuring=source_digest("stereobench.audit.pair", "stereobench.audit.sharing"),
+        code=source_digest("stereobench.audit.audit"),
+        templates=templates_of("stereobench/audit/page.html.jinja"),
     message:
         "Auditing dataset {wildcards.dataset}"
     script:

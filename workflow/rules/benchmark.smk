@@ -23,7 +23,7 @@ rule match:
         dataset=lambda w: dataset_entry(w.dataset),
         method=lambda w: method_entry(w.method, w.dataset),
         split=SETTINGS.benchmark.split,
-        code=lambda w: source_digest("matching.benchmark.predictions", *method_modules(w.method)),
+        code=lambda w: source_digest("stereobench.scores.predictions", *method_modules(w.method)),
     message:
         "Matching dataset {wildcards.dataset} by {wildcards.method}"
     script:
@@ -62,7 +62,7 @@ rule score:
         bootstrap=SETTINGS.benchmark.bootstrap,
         panels=SETTINGS.benchmark.panels,
         seed=SETTINGS.seed,
-        code=source_digest("matching.benchmark.score_method"),
+        code=source_digest("stereobench.scores.score_method"),
     message:
         "Scoring {wildcards.method} on dataset {wildcards.dataset}"
     script:
@@ -91,7 +91,7 @@ rule submission:
     params:
         sources=upstream("submission"),
         script=content_of("../scripts/submission.py"),
-        code=source_digest("matching.benchmark.submission"),
+        code=source_digest("stereobench.scores.submission"),
     message:
         "Packing the results of {wildcards.method} on dataset {wildcards.dataset}"
     script:
@@ -147,8 +147,8 @@ rule benchmark_tables:
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
         seed=SETTINGS.seed,
-        code=source_digest("matching.benchmark.compare_methods"),
-        templates=templates_of("matching", "benchmark", "page.html.jinja"),
+        code=source_digest("stereobench.scores.compare_methods"),
+        templates=templates_of("stereobench/scores/page.html.jinja"),
     message:
         "Comparing the methods on dataset {wildcards.dataset}"
     script:

@@ -22,7 +22,7 @@ rule closure_of_site:
         sources=upstream("closure_of_site"),
         script=content_of("../scripts/closure_of_site.py"),
         pairs=lambda w: {s: ADJUSTED[s] for s in adjusted_pairs(w.city)},
-        code=source_digest("evaluation.closure"),
+        code=source_digest("stereotruth.evaluate.closure"),
     message:
         "Closing the triplets of {wildcards.city}"
     script:

@@ -4,11 +4,11 @@ from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
-from stereotruth.config.configuration import Configuration
-from stereotruth.epochs import epoch_of_city
-from stereotruth.errors import InputError, in_words
-from stereotruth.products.provenance import PACKAGE, file_sha256, script_digest, source_digest
-from stereotruth.project import (
+from stereotruth.core.config.configuration import Configuration
+from stereotruth.project.epochs import epoch_of_city
+from stereotruth.core.errors import InputError, in_words
+from stereotruth.core.products.provenance import SOURCES, file_sha256, script_digest, source_digest
+from stereotruth.project.project import (
     FILES,
     adjusted_scenes,
     check_fixed,
@@ -23,8 +23,8 @@ from stereotruth.project import (
     stores_of,
     surfaces_of,
 )
-from stereotruth.dates import epoch_year
-from stereotruth.simulate import cities
+from stereotruth.core.dates import epoch_year
+from stereocities import cities
 
 CONDA = FILES / "envs" / "workflow.yaml"
 VIEWS = ("left", "right")
@@ -81,10 +81,10 @@ def scenes_of(city):
     return found
 
 
-def templates_of(*parts):
+def templates_of(template):
     """Digests of a page's template and of what all pages share."""
-    shared = sorted((PACKAGE / "pages").glob("*.jinja"))
-    return [file_sha256(file) for file in (PACKAGE.joinpath(*parts), *shared)]
+    shared = sorted((SOURCES / "stereotruth/pages").glob("*.jinja"))
+    return [file_sha256(file) for file in (SOURCES / template, *shared)]
 
 
 def content_of(script):

@@ -18,7 +18,7 @@ rule grid_truth:
     params:
         sources=upstream("grid_truth"),
         script=content_of("../scripts/grid_truth.py"),
-        code=source_digest("evaluation.epipolar_truth", "simulate.cities"),
+        code=source_digest("stereotruth.evaluate.epipolar_truth", "stereocities.cities"),
     message:
         "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
     script:
@@ -51,7 +51,7 @@ rule evaluate_truth:
     params:
         sources=upstream("evaluate_truth"),
         script=content_of("../scripts/evaluate_truth.py"),
-        code=source_digest("evaluation.labels_against_truth"),
+        code=source_digest("stereotruth.evaluate.labels_against_truth"),
     message:
         "Comparing scene {wildcards.scene} with its exact truth"
     script:
@@ -89,7 +89,7 @@ rule evaluate_truth_city:
         sources=upstream("evaluate_truth_city"),
         script=content_of("../scripts/evaluate_truth_city.py"),
         scenes=lambda w: synthetic_scenes(w.city),
-        code=source_digest("evaluation.labels_against_truth"),
+        code=source_digest("stereotruth.evaluate.labels_against_truth"),
     message:
         "Comparing city {wildcards.city} with its exact truth"
     script:

@@ -47,7 +47,7 @@ rule evaluate_images:
         sources=upstream("evaluate_images"),
         script=content_of("../scripts/evaluate_images.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
-        code=source_digest("evaluation.labels_against_images"),
+        code=source_digest("stereotruth.evaluate.labels_against_images"),
     message:
         "Holding the labels of {wildcards.city} against the images"
     script:

@@ -53,7 +53,7 @@ rule export:
             "seed": SETTINGS.seed,
             "strict": SETTINGS.strict,
         },
-        code=source_digest("dataset.export"),
+        code=source_digest("stereotruth.tiles.export"),
     message:
         "Cutting the tiles of {wildcards.city}"
     script:
@@ -82,7 +82,7 @@ rule originals:
         sources=upstream("originals"),
         script=content_of("../scripts/originals.py"),
         images=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
-        code=source_digest("dataset.originals"),
+        code=source_digest("stereotruth.tiles.originals"),
     message:
         "Cropping the original images of {wildcards.city}"
     script:
@@ -114,7 +114,7 @@ rule dataset:
             "acquired": SETTINGS.dataset.acquired,
         },
         layouts=[name for name in SETTINGS.dataset.layouts if name != "whu"],
-        code=source_digest("dataset.published_layout", "dataset.other_layouts"),
+        code=source_digest("stereotruth.tiles.published_layout", "stereotruth.tiles.other_layouts"),
     message:
         "Putting the cities together in the layout of the published dataset"
     script:

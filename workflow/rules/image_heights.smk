@@ -24,7 +24,7 @@ rule image_heights:
         sources=upstream("image_heights"),
         script=content_of("../scripts/image_heights.py"),
         view=lambda w: scene_of_image(w.image)[1],
-        code=source_digest("disparity.image_heights"),
+        code=source_digest("stereotruth.labels.image_heights"),
     message:
         "Heights of what image {wildcards.image} shows"
     script:

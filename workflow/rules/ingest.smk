@@ -24,7 +24,7 @@ rule ingest:
         acquired=lambda w: ACQUIRED.get(str(LIDAR[w.scene][w.lidar]), []),
         drop_classes=sorted(SETTINGS.ingest.drop_classes),
         footprint=lambda w: ground_of_stores(w.scene),
-        code=source_digest("lidar.ingest"),
+        code=source_digest("stereotruth.lidar.ingest"),
     message:
         "Reading LiDAR file {wildcards.lidar} of scene {wildcards.scene}"
     script:

@@ -5,8 +5,8 @@ from functools import cache
 
 from snakemake.logging import logger
 
-from stereotruth.matching.kinds import KINDS, kind_of
-from stereotruth.config.methods import SceneMatching
+from stereobench.methods.kinds import KINDS, kind_of
+from stereotruth.core.config.methods import SceneMatching
 
 
 def dataset_settings(name):

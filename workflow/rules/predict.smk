@@ -23,7 +23,9 @@ rule predict_scene:
         script=content_of("../scripts/predict_scene.py"),
         method=lambda w: method_entry(w.method, prediction_dataset()),
         settings=lambda w: scene_prediction(),
-        code=lambda w: source_digest("matching.scenes.predict_scene", *method_modules(w.method)),
+        code=lambda w: source_digest(
+            "stereobench.methods.scenes.predict_scene", *method_modules(w.method)
+        ),
     message:
         "Disparities of scene {wildcards.scene} by {wildcards.method}"
     script:
@@ -52,7 +54,7 @@ rule dsm:
         sources=upstream("dsm"),
         script=content_of("../scripts/dsm.py"),
         settings=SETTINGS.predict.dsm.model_dump(),
-        code=source_digest("matching.scenes.surface_model"),
+        code=source_digest("stereobench.methods.scenes.surface_model"),
     message:
         "Surface model of scene {wildcards.scene} by {wildcards.method}"
     script:
@@ -80,8 +82,8 @@ rule score_dsm:
     params:
         sources=upstream("score_dsm"),
         script=content_of("../scripts/score_dsm.py"),
-        code=source_digest("evaluation.surface_models.page"),
-        templates=templates_of("evaluation", "surface_models", "page.html.jinja"),
+        code=source_digest("stereotruth.evaluate.surface_models.page"),
+        templates=templates_of("stereotruth/evaluate/surface_models/page.html.jinja"),
     message:
         "Judging the surface model of scene {wildcards.scene} by {wildcards.method}"
     script:

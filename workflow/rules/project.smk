@@ -29,7 +29,7 @@ rule project:
         view="left",
         settings=PROJECTION,
         light=lambda w: light_of(w.scene),
-        code=source_digest("disparity.project"),
+        code=source_digest("stereotruth.labels.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene}"
     script:
@@ -57,7 +57,7 @@ use rule project as project_right with:
         view="right",
         settings=PROJECTION,
         light=lambda w: light_of(w.scene),
-        code=source_digest("disparity.project"),
+        code=source_digest("stereotruth.labels.project"),
     message:
         "Projecting the point cloud of scene {wildcards.scene} into the right view"
 
@@ -89,7 +89,7 @@ rule project_strip:
         store="results/project/{city}/{scene}{side}.zarr",
         settings=PROJECTION,
         light=lambda w: light_of(w.scene),
-        code=source_digest("disparity.project"),
+        code=source_digest("stereotruth.labels.project"),
     message:
         "Projecting strip {wildcards.strip} of the point cloud of scene {wildcards.scene}"
     script:

@@ -24,7 +24,11 @@ rule rectify:
         sources=upstream("rectify"),
         script=content_of("../scripts/rectify.py"),
         bands=SETTINGS.rectify.model_dump(),
-        code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.aligned_pair"),
+        code=source_digest(
+            "stereotruth.epipolar.rectify",
+            "stereotruth.epipolar.fit",
+            "stereotruth.align.aligned_pair",
+        ),
     message:
         "Making epipolar images of scene {wildcards.scene}"
     script:
@@ -55,7 +59,11 @@ rule rectify_strip:
         script=content_of("../scripts/rectify_strip.py"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
         bands=SETTINGS.rectify.model_dump(),
-        code=source_digest("epipolar.rectify", "epipolar.fit", "alignment.aligned_pair"),
+        code=source_digest(
+            "stereotruth.epipolar.rectify",
+            "stereotruth.epipolar.fit",
+            "stereotruth.align.aligned_pair",
+        ),
     message:
         "Making strip {wildcards.strip} of the epipolar images of scene {wildcards.scene}"
     script:

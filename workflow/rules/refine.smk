@@ -31,7 +31,11 @@ rule refine:
         strict=SETTINGS.strict,
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
         bands=SETTINGS.rectify.model_dump(),
-        code=source_digest("alignment.refine", "alignment.refine_report", "alignment.tie_equations"),
+        code=source_digest(
+            "stereotruth.align.refine",
+            "stereotruth.align.refine_report",
+            "stereotruth.align.tie_equations",
+        ),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
     script:
@@ -63,7 +67,7 @@ rule draw_refinement:
     params:
         sources=upstream("draw_refinement"),
         script=content_of("../scripts/draw_refinement.py"),
-        code=source_digest("alignment.refine_figure"),
+        code=source_digest("stereotruth.align.refine_figure"),
     message:
         "Drawing the tie points of scene {wildcards.scene}"
     script:

@@ -35,8 +35,8 @@ rule report_city:
         sources=upstream("report_city"),
         script=content_of("../scripts/report_city.py"),
         sliders=SETTINGS.report.sliders,
-        code=source_digest("report.page"),
-        templates=templates_of("report", "page.html.jinja"),
+        code=source_digest("stereotruth.evaluate.report.page"),
+        templates=templates_of("stereotruth/evaluate/report/page.html.jinja"),
     message:
         "Writing the page of {wildcards.city}"
     script:
@@ -75,8 +75,12 @@ rule report_site:
             for name, row in sheet_images(w.city).items()
         },
         scenes=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
-        code=source_digest("report.site_page", "alignment.site_images", "lidar.roughness"),
-        templates=templates_of("report", "site_page.html.jinja"),
+        code=source_digest(
+            "stereotruth.evaluate.report.site_page",
+            "stereotruth.align.site_images",
+            "stereotruth.lidar.roughness",
+        ),
+        templates=templates_of("stereotruth/evaluate/report/site_page.html.jinja"),
     message:
         "Writing the page of the images of {wildcards.city}"
     script:

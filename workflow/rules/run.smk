@@ -3,8 +3,8 @@
 import shutil
 import sys
 
-from stereotruth.products.locks import FileLock
-from stereotruth.products.making import begin_notes, noted
+from stereotruth.core.products.locks import FileLock
+from stereotruth.core.products.making import begin_notes, noted
 
 LOCKS = []  # held until this process ends
 
@@ -30,7 +30,7 @@ onstart:
 
 def made():
     """What the last lines of a run say: what it has made, its figures, and where to look."""
-    from stereotruth.last_lines import last_lines  # takes a second; no plan needs it
+    from stereotruth.project.last_lines import last_lines  # takes a second; no plan needs it
 
     products = [f"{BUCKET}/{path.removeprefix(PLACE)}" if BUCKET else path for path in noted()]
     left_out = [
@@ -44,7 +44,7 @@ def made():
 
 def list_pages():
     """Write the index of all pages, of this run and of earlier ones; its path, if there are any."""
-    from stereotruth.report.index_page import write_index
+    from stereotruth.evaluate.report.index_page import write_index
 
     try:
         return write_index()
@@ -68,6 +68,6 @@ onsuccess:
 
 onerror:
     list_pages()
-    from stereotruth.last_lines import complaints
+    from stereotruth.project.last_lines import complaints
 
     say(complaints(log))

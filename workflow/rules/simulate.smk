@@ -17,7 +17,7 @@ rule simulate_city:
     params:
         sources=upstream("simulate_city"),
         script=content_of("../scripts/simulate_city.py"),
-        code=source_digest("simulate.built_city", "simulate.cities"),
+        code=source_digest("stereocities.built_city", "stereocities.cities"),
     message:
         "Building synthetic city {wildcards.city}"
     script:
@@ -45,7 +45,7 @@ rule simulate_image:
         sources=upstream("simulate_image"),
         script=content_of("../scripts/simulate_image.py"),
         seed=SETTINGS.seed,
-        code=source_digest("simulate.render", "simulate.cities"),
+        code=source_digest("stereocities.render", "stereocities.cities"),
     message:
         "Rendering the {wildcards.view} image of synthetic scene {wildcards.scene}"
     script:
@@ -75,7 +75,7 @@ rule simulate_lidar:
         script=content_of("../scripts/simulate_lidar.py"),
         spacing_m=SETTINGS.simulate.lidar_spacing_m,
         seed=SETTINGS.seed,
-        code=source_digest("simulate.lidar", "simulate.cities"),
+        code=source_digest("stereocities.lidar", "stereocities.cities"),
     message:
         "Flying LiDAR tile {wildcards.tile} of synthetic scene {wildcards.scene}"
     script:
@@ -105,7 +105,9 @@ rule simulate_truth:
         sources=upstream("simulate_truth"),
         script=content_of("../scripts/simulate_truth.py"),
         seed=SETTINGS.seed,
-        code=source_digest("simulate.truth", "simulate.control_points", "simulate.cities"),
+        code=source_digest(
+            "stereocities.truth", "stereocities.control_points", "stereocities.cities"
+        ),
     message:
         "Writing the exact truth of synthetic scene {wildcards.scene}"
     script:

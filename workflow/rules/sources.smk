@@ -8,8 +8,8 @@ jobs failed or were killed in between. Times of users' files count for nothing.
 
 from functools import cache
 
-from stereotruth.products.inputs import Checksums
-from stereotruth.products.provenance import digest
+from stereotruth.core.products.inputs import Checksums
+from stereotruth.core.products.provenance import digest
 
 CHECKSUMS = Checksums(Path(".snakemake", "stereotruth", "checksums"))
 BUCKET = workflow.storage_settings.default_storage_prefix or ""

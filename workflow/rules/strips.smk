@@ -20,7 +20,7 @@ rule compare_strips:
         sources=upstream("compare_strips"),
         script=content_of("../scripts/compare_strips.py"),
         taken_out=SETTINGS.ingest.strips == "adjusted",
-        code=source_digest("lidar.strip_comparison"),
+        code=source_digest("stereotruth.lidar.strip_comparison"),
     message:
         "Comparing the strips of the LiDAR of scene {wildcards.scene}"
     script:
@@ -48,7 +48,7 @@ rule move_strips:
     params:
         sources=upstream("move_strips"),
         script=content_of("../scripts/move_strips.py"),
-        code=source_digest("lidar.strip_moves"),
+        code=source_digest("stereotruth.lidar.strip_moves"),
     message:
         "Moving the points of {wildcards.lidar} by the offsets of their strips"
     script:

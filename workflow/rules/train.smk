@@ -32,7 +32,7 @@ rule train:
         kind=lambda w: method_settings(w.method).kind,
         training=lambda w: training_of(w.method),
         code=lambda w: source_digest(
-            "matching.networks.training", "matching.kinds", *method_modules(w.method)
+            "stereobench.networks.training", "stereobench.methods.kinds", *method_modules(w.method)
         ),
     message:
         "Training {wildcards.method} on dataset {wildcards.dataset}"

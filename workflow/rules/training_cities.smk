@@ -1,6 +1,6 @@
 """Tiles of cities that no test shows, to train on."""
 
-from stereotruth.simulate.cities import cities_for
+from stereocities.cities import cities_for
 
 
 rule training_city:
@@ -23,7 +23,7 @@ rule training_city:
         script=content_of("../scripts/training_city.py"),
         size=SETTINGS.tiles.size,
         seed=SETTINGS.seed,
-        code=source_digest("evaluation.exact_tiles"),
+        code=source_digest("stereotruth.evaluate.exact_tiles"),
     message:
         "Tiles of training city {wildcards.number}"
     script:
@@ -53,7 +53,7 @@ rule training_cities:
     params:
         sources=upstream("training_cities"),
         script=content_of("../scripts/training_cities.py"),
-        code=source_digest("evaluation.exact_tiles"),
+        code=source_digest("stereotruth.evaluate.exact_tiles"),
     message:
         "{wildcards.tiles} tiles of training cities"
     script:

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from stereotruth.alignment.site_adjustment import adjust_site
-from stereotruth.alignment.site_pair import ScenePair, write_site
-from stereotruth.job import job
+from stereotruth.align.site_adjustment import adjust_site
+from stereotruth.align.site_pair import ScenePair, write_site
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import checksums, describe, file_sha256
 from stereotruth.lidar.frames import Epoch
-from stereotruth.products.making import making
-from stereotruth.products.provenance import checksums, describe, file_sha256
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

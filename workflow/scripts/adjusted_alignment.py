@@ -2,15 +2,10 @@
 
 from pathlib import Path
 
-from stereotruth.alignment.site_pair import (
-    ScenePair,
-    pair_alignment,
-    read_site,
-    write_site,
-)
-from stereotruth.job import job
-from stereotruth.products.making import making
-from stereotruth.products.provenance import checksums, describe, digest
+from stereotruth.align.site_pair import ScenePair, pair_alignment, read_site, write_site
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import checksums, describe, digest
 
 if __name__ == "__main__":
     scene, given = snakemake.wildcards.scene, snakemake.input

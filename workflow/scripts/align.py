@@ -3,14 +3,14 @@
 import logging
 from contextlib import suppress
 
-from stereotruth.alignment.align import align, from_rpcs
-from stereotruth.alignment.align_report import write_alignment
-from stereotruth.alignment.control_points import TooFewPoints, read_gcps
-from stereotruth.errors import InputError
-from stereotruth.job import job
+from stereotruth.align.align import align, from_rpcs
+from stereotruth.align.align_report import write_alignment
+from stereotruth.align.control_points import TooFewPoints, read_gcps
+from stereotruth.core.errors import InputError
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import describe
 from stereotruth.lidar.frames import Epoch
-from stereotruth.products.making import making
-from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene

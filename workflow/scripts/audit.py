@@ -1,12 +1,12 @@
 """What the images and labels of a dataset say of each other."""
 
-from stereotruth.config.methods import Audit
-from stereotruth.dataset.stereo_dataset import StereoDataset
-from stereotruth.evaluation.audit.audit import audit
-from stereotruth.job import job
+from stereobench.audit.audit import audit
+from stereotruth.core.config.methods import Audit
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.report.index_page import write_index
 from stereotruth.pages.page import INDEX
-from stereotruth.products.making import making
-from stereotruth.report.index_page import write_index
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     name, params = snakemake.wildcards.dataset, snakemake.params

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from stereotruth.dataset.stereo_dataset import StereoDataset
-from stereotruth.job import job
-from stereotruth.matching.benchmark.compare_methods import compare
+from stereobench.scores.compare_methods import compare
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.report.index_page import write_index
 from stereotruth.pages.page import INDEX
-from stereotruth.products.making import making
-from stereotruth.report.index_page import write_index
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params

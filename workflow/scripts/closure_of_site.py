@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from stereotruth.evaluation.closure import PairFiles, closure, write_closure
-from stereotruth.job import job
-from stereotruth.products.grids import require_complete
-from stereotruth.products.making import making
-from stereotruth.products.provenance import describe, digest, file_sha256
+from stereotruth.core.job import job
+from stereotruth.core.products.grids import require_complete
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import describe, digest, file_sha256
+from stereotruth.evaluate.closure import PairFiles, closure, write_closure
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

@@ -3,11 +3,11 @@
 import logging
 from dataclasses import replace
 
-from stereotruth.job import job
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import describe, digest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
-from stereotruth.products.making import making
-from stereotruth.products.provenance import describe, digest
 
 if __name__ == "__main__":
     with (

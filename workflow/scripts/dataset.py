@@ -1,9 +1,9 @@
 """All cities' tiles in the layout of the published dataset, and in others."""
 
-from stereotruth.dataset.other_layouts import write_layout
-from stereotruth.dataset.published_layout import assemble_dataset
-from stereotruth.job import job
-from stereotruth.products.making import making
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.tiles.other_layouts import write_layout
+from stereotruth.tiles.published_layout import assemble_dataset
 
 if __name__ == "__main__":
     dataset, *others = snakemake.output

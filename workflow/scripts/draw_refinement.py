@@ -1,9 +1,9 @@
 """One scene's tie points of the refinement, drawn."""
 
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.refine_figure import draw_refinement
-from stereotruth.job import job
-from stereotruth.products.making import making
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.refine_figure import draw_refinement
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     given = snakemake.input

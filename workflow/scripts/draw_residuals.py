@@ -1,9 +1,9 @@
 """One scene's residuals of the ground control points, drawn."""
 
-from stereotruth.alignment.align_figure import draw_residuals
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.job import job
-from stereotruth.products.making import making
+from stereotruth.align.align_figure import draw_residuals
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     with (

@@ -1,8 +1,8 @@
 """A scene's disparities to a surface model."""
 
-from stereotruth.job import dask_scheduler, job
-from stereotruth.matching.scenes.surface_model import write_dsm
-from stereotruth.products.making import making
+from stereobench.methods.scenes.surface_model import write_dsm
+from stereotruth.core.job import dask_scheduler, job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method

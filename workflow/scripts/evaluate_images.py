@@ -1,8 +1,8 @@
 """One city's labels against its images: SIFT matches (table 4) and image warping."""
 
-from stereotruth.evaluation.labels_against_images import evaluate_city
-from stereotruth.job import job
-from stereotruth.products.making import making
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.labels_against_images import evaluate_city
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from stereotruth.evaluation.labels_against_truth import MadeScene, evaluate_truth
-from stereotruth.job import job
-from stereotruth.products.making import making
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.labels_against_truth import MadeScene, evaluate_truth
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene

@@ -3,13 +3,13 @@
 import json
 from pathlib import Path
 
-from stereotruth.config.labels import Export
-from stereotruth.dataset.export import City, Extras, export_city
-from stereotruth.dataset.scene_stores import SceneFiles
-from stereotruth.dataset.summary import summary_lines
-from stereotruth.job import job
-from stereotruth.products.files import atomic_file
-from stereotruth.products.making import making
+from stereotruth.core.config.labels import Export
+from stereotruth.core.job import job
+from stereotruth.core.products.files import atomic_file
+from stereotruth.core.products.making import making
+from stereotruth.tiles.export import City, Extras, export_city
+from stereotruth.tiles.scene_stores import SceneFiles
+from stereotruth.tiles.summary import summary_lines
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city

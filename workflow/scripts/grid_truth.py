@@ -1,10 +1,10 @@
 """The exact truth of one synthetic scene on its left epipolar grid."""
 
-from stereotruth.evaluation.epipolar_truth import write_grid_truth
-from stereotruth.job import job
-from stereotruth.products.making import making
-from stereotruth.products.provenance import describe
-from stereotruth.simulate.cities import city_of
+from stereocities.cities import city_of
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import describe
+from stereotruth.evaluate.epipolar_truth import write_grid_truth
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)

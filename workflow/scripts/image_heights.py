@@ -1,10 +1,10 @@
 """Heights, positions and classes of what an original image shows."""
 
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.disparity.image_heights import open_inputs, write_image_heights
-from stereotruth.job import job
-from stereotruth.products.making import making
-from stereotruth.products.provenance import checksums, describe
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import checksums, describe
+from stereotruth.labels.image_heights import open_inputs, write_image_heights
 
 if __name__ == "__main__":
     image, view = snakemake.wildcards.image, snakemake.params.view

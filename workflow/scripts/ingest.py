@@ -1,12 +1,12 @@
 """One LiDAR file to a point store."""
 
-from stereotruth.job import in_own_process, job
+from stereotruth.core.job import in_own_process, job
+from stereotruth.core.products.file_parts import prune
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import describe
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.frames import Epoch, Epochs
 from stereotruth.lidar.ingest import ingest
-from stereotruth.products.file_parts import prune
-from stereotruth.products.making import making
-from stereotruth.products.provenance import describe
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None

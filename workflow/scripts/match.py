@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from stereotruth.dataset.stereo_dataset import StereoDataset
-from stereotruth.job import job
-from stereotruth.matching.benchmark.predictions import predict
-from stereotruth.products.making import making
+from stereobench.scores.predictions import predict
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params

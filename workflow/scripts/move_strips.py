@@ -1,11 +1,11 @@
 """The points of one LiDAR file, moved by what their strips are off."""
 
-from stereotruth.job import job
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import checksums, describe, digest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_moves import move_strips
 from stereotruth.lidar.strip_offsets import RECORD, StripOffsets
-from stereotruth.products.making import making
-from stereotruth.products.provenance import checksums, describe, digest
 
 if __name__ == "__main__":
     points, strips = snakemake.input.points, snakemake.input.strips

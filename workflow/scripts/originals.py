@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from stereotruth.dataset.originals import write_originals
-from stereotruth.job import job
-from stereotruth.products.making import making
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.tiles.originals import write_originals
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.wildcards.city

@@ -1,9 +1,9 @@
 """A stereo method over a whole scene."""
 
-from stereotruth.config.methods import SceneMatching
-from stereotruth.job import dask_scheduler, job
-from stereotruth.matching.scenes.predict_scene import predict_scene
-from stereotruth.products.making import making
+from stereobench.methods.scenes.predict_scene import predict_scene
+from stereotruth.core.config.methods import SceneMatching
+from stereotruth.core.job import dask_scheduler, job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method

@@ -1,10 +1,10 @@
 """One scene's points to its disparity grid."""
 
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.job import dask_scheduler, job
-from stereotruth.products.making import making
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.job import dask_scheduler, job
+from stereotruth.core.products.making import making
+from stereotruth.labels.project import project_scene
+from stereotruth.labels.scene_inputs import SceneInputs
 
 if __name__ == "__main__":
     scene, address = snakemake.wildcards.scene, snakemake.resources.dask

@@ -1,11 +1,11 @@
 """One strip of a scene's points to the blocks of its disparity grid."""
 
-from stereotruth.config.labels import LabelSettings
-from stereotruth.disparity.project import project_scene
-from stereotruth.disparity.scene_inputs import SceneInputs
-from stereotruth.job import job
-from stereotruth.products.grids import Strip
-from stereotruth.products.making import making
+from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.job import job
+from stereotruth.core.products.grids import Strip
+from stereotruth.core.products.making import making
+from stereotruth.labels.project import project_scene
+from stereotruth.labels.scene_inputs import SceneInputs
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)

@@ -1,13 +1,13 @@
 """One aligned pair to epipolar images."""
 
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.config.labels import Rectify
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.core.config.labels import Rectify
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import checksums, describe
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.image_reader import open_pair
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.job import job
-from stereotruth.products.making import making
-from stereotruth.products.provenance import checksums, describe
+from stereotruth.sensor.image_reader import open_pair
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene

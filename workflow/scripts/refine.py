@@ -1,14 +1,14 @@
 """What is left between one scene's LiDAR and its two images, taken out of the alignment."""
 
-from stereotruth.alignment.aligned_pair import Alignment
-from stereotruth.alignment.refine import refine
-from stereotruth.alignment.refine_report import write_refinement
-from stereotruth.alignment.tie_equations import write_equations
-from stereotruth.config.labels import Rectify
-from stereotruth.job import job
+from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.refine import refine
+from stereotruth.align.refine_report import write_refinement
+from stereotruth.align.tie_equations import write_equations
+from stereotruth.core.config.labels import Rectify
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import checksums, describe, digest
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.products.making import making
-from stereotruth.products.provenance import checksums, describe, digest
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from stereotruth.job import job
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.report.index_page import write_index
+from stereotruth.evaluate.report.page import CityFiles, write_report
 from stereotruth.pages.page import INDEX
-from stereotruth.products.making import making
-from stereotruth.report.index_page import write_index
-from stereotruth.report.page import CityFiles, write_report
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

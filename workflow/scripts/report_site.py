@@ -2,16 +2,16 @@
 
 from pathlib import Path
 
-from stereotruth.alignment.site_images import GivenImage, open_image
-from stereotruth.epipolar.pair_quality import rate
-from stereotruth.job import job
+from stereotruth.align.site_images import GivenImage, open_image
+from stereotruth.core.job import job
+from stereotruth.core.products.files import read_json
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.report.index_page import write_index
+from stereotruth.evaluate.report.site_page import write_site_page
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.roughness import roughness_m
 from stereotruth.pages.page import INDEX
-from stereotruth.products.files import read_json
-from stereotruth.products.making import making
-from stereotruth.report.index_page import write_index
-from stereotruth.report.site_page import write_site_page
+from stereotruth.sensor.pair_quality import rate
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

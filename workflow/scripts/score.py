@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from stereotruth.dataset.stereo_dataset import StereoDataset
-from stereotruth.job import job
-from stereotruth.matching.benchmark.score_method import ScoringPlan, score
-from stereotruth.matching.benchmark.strata import Products
-from stereotruth.products.making import making
+from stereobench.scores.score_method import ScoringPlan, score
+from stereobench.scores.strata import Products
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params

@@ -1,12 +1,12 @@
 """A scene's surface model against its LiDAR."""
 
-from stereotruth.evaluation.surface_models.page import write_verdict
-from stereotruth.evaluation.surface_models.reference import LidarReference
-from stereotruth.evaluation.surface_models.score import score_surface_model
-from stereotruth.job import job
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.report.index_page import write_index
+from stereotruth.evaluate.surface_models.page import write_verdict
+from stereotruth.evaluate.surface_models.reference import LidarReference
+from stereotruth.evaluate.surface_models.score import score_surface_model
 from stereotruth.pages.page import INDEX
-from stereotruth.products.making import making
-from stereotruth.report.index_page import write_index
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method

@@ -1,9 +1,9 @@
 """What stands in a synthetic city, for the jobs that look at it."""
 
-from stereotruth.job import job
-from stereotruth.products.making import making
-from stereotruth.simulate.built_city import write_surfaces
-from stereotruth.simulate.cities import city_of
+from stereocities.built_city import write_surfaces
+from stereocities.cities import city_of
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)

@@ -1,9 +1,9 @@
 """One image of a synthetic scene."""
 
-from stereotruth.job import job
-from stereotruth.products.making import making
-from stereotruth.simulate.cities import city_of
-from stereotruth.simulate.render import simulate_image
+from stereocities.cities import city_of
+from stereocities.render import simulate_image
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)

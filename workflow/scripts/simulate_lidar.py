@@ -1,9 +1,9 @@
 """One LiDAR file of a synthetic scene."""
 
-from stereotruth.job import job
-from stereotruth.products.making import making
-from stereotruth.simulate.cities import city_of
-from stereotruth.simulate.lidar import simulate_lidar_tile
+from stereocities.cities import city_of
+from stereocities.lidar import simulate_lidar_tile
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)

@@ -1,10 +1,10 @@
 """The exact truth of a synthetic scene: per pixel, and as points."""
 
-from stereotruth.job import job
-from stereotruth.products.making import making
-from stereotruth.simulate.cities import city_of
-from stereotruth.simulate.control_points import simulate_points
-from stereotruth.simulate.truth import simulate_truth
+from stereocities.cities import city_of
+from stereocities.control_points import simulate_points
+from stereocities.truth import simulate_truth
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)

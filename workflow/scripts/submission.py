@@ -1,8 +1,8 @@
 """The results of a stereo method, packed to be scored elsewhere."""
 
-from stereotruth.job import job
-from stereotruth.matching.benchmark.submission import pack
-from stereotruth.products.making import making
+from stereobench.scores.submission import pack
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
 
 if __name__ == "__main__":
     of = snakemake.wildcards

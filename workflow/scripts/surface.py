@@ -1,10 +1,10 @@
 """The points of a site to their surface, for all images that show it."""
 
-from stereotruth.epipolar.shown_ground import GroundOfImages
-from stereotruth.job import job
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.core.products.provenance import checksums
 from stereotruth.lidar.point_store import open_stores
-from stereotruth.products.making import making
-from stereotruth.products.provenance import checksums
+from stereotruth.sensor.shown_ground import GroundOfImages
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import ground_cell
 

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from stereotruth.dataset.stereo_dataset import StereoDataset
-from stereotruth.job import job
-from stereotruth.matching.kinds import need_pytorch
-from stereotruth.products.making import making
+from stereobench.methods.kinds import need_pytorch
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
@@ -14,9 +14,9 @@ if __name__ == "__main__":
         making(snakemake.input, snakemake.output),
     ):
         need_pytorch(of.method, params.kind)
-        from stereotruth.matching.networks.training import train
-        from stereotruth.matching.networks.training_settings import TrainingSettings
-        from stereotruth.matching.networks.training_state import model_of
+        from stereobench.networks.training import train
+        from stereobench.networks.training_settings import TrainingSettings
+        from stereobench.networks.training_state import model_of
 
         dataset = StereoDataset.of(of.dataset, params.dataset)
         training = TrainingSettings(**params.training)

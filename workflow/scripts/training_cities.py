@@ -1,8 +1,8 @@
 """Tiles of training cities put together as a dataset."""
 
-from stereotruth.evaluation.exact_tiles import gather
-from stereotruth.job import job
-from stereotruth.products.making import making
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.exact_tiles import gather
 
 if __name__ == "__main__":
     count = snakemake.wildcards.tiles

@@ -1,8 +1,8 @@
 """Tiles of one training city, with exact labels."""
 
-from stereotruth.evaluation.exact_tiles import make_city
-from stereotruth.job import job
-from stereotruth.products.making import making
+from stereotruth.core.job import job
+from stereotruth.core.products.making import making
+from stereotruth.evaluate.exact_tiles import make_city
 
 if __name__ == "__main__":
     number = snakemake.wildcards.number

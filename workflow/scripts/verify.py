@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from stereotruth.dataset.verify import verify
-from stereotruth.errors import InputError
-from stereotruth.job import job
+from stereotruth.core.errors import InputError
+from stereotruth.core.job import job
+from stereotruth.tiles.verify import verify
 
 if __name__ == "__main__":
     with job(snakemake.log[0], "verify"):

@@ -27,13 +27,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..core.errors import InputError
+from ..sensor.pair_geometry import convergence_angle, find_overlap, find_rotation, view_order
+from ..sensor.rpc import SensorModel
+from ..sensor.virtual_points import Points, box_defect, common_box, frame, of_box, of_frames, steps
 from .model import EpipolarModel, ImageModel
-from .pair_geometry import convergence_angle, find_overlap, find_rotation, view_order
-from .rpc import SensorModel
 from .spline_fit import grow, y_parallax
 from .spline_kernels import forward_with_slopes
-from .virtual_points import Points, box_defect, common_box, frame, of_box, of_frames, steps
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]

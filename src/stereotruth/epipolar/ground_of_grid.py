@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyproj
 
-from ..errors import InputError
+from ..core.errors import InputError
 from .model import EpipolarModel
 
 if TYPE_CHECKING:
@@ -19,10 +19,10 @@ SYSTEM = "EPSG:4979"  # WGS 84: longitude, latitude, ellipsoidal height
 def with_ground(grid: xr.Dataset) -> xr.Dataset:
     """A grid, or a window of it, with the coordinates ``lon`` and ``lat`` [y, x] of its heights.
 
-    ``grid``: of :func:`stereotruth.products.grids.open_grid`, with the array ``height`` (m over the
-    ellipsoid) and the epipolar model in its attributes, as those of ``results/project`` have them.
-    Degrees, NaN where there is no height; the coordinate ``crs`` holds the system of all three by
-    the CF conventions. All of the window is read: take a part of a large grid by ``isel`` or
+    ``grid``: of :func:`stereotruth.core.products.grids.open_grid`, with the array ``height`` (m
+    over the ellipsoid) and the epipolar model in its attributes, as those of ``results/project``
+    have them. Degrees, NaN where there is no height; the coordinate ``crs`` holds the system of all
+    three by the CF conventions. All of the window is read: take a part of a large grid by ``isel`` or
     ``sel`` first. Raises InputError for a grid without heights or model.
     """
     for name, there in (("height", grid), ("epipolar", grid.attrs)):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
-from ..numerics.degrees import DEGREE_M
+from ..core.kernels import inner, kernel
+from ..core.numerics.degrees import DEGREE_M
+from ..sensor.rpc import project_point
 from .model import EpipolarModel
-from .rpc import project_point
 from .spline_kernels import inverse_point
 
 Floats = NDArray[np.float64]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..products.files import atomic_file, read_record, sealed
-from .line_correction import LineCorrection, of_record, read_correction
-from .rpc import SensorModel
+from ..core.products.files import atomic_file, read_record, sealed
+from ..sensor.line_correction import LineCorrection, of_record, read_correction
+from ..sensor.rpc import SensorModel
 from .spline_kernels import POWERS, ground_points_to_epipolar, map_points
 
 Floats = NDArray[np.float64]

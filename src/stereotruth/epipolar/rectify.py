@@ -17,18 +17,18 @@ import dask.threaded
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..job import block_progress
-from ..numerics.cubic_convolution import SIX_POINT_RADIUS
-from ..products.grids import Layer, Strip, blocks
-from ..products.provenance import digest, file_sha256, source_digest
-from ..products.resumable_grids import BlockStore, resumable_grid
-from .acquisition import read_acquisition
-from .colours import COLOURS
-from .image_reader import Source
+from ..core.errors import InputError
+from ..core.job import block_progress
+from ..core.numerics.cubic_convolution import SIX_POINT_RADIUS
+from ..core.products.grids import Layer, Strip, blocks
+from ..core.products.provenance import digest, file_sha256, source_digest
+from ..core.products.resumable_grids import BlockStore, resumable_grid
+from ..sensor.acquisition import read_acquisition
+from ..sensor.colours import COLOURS
+from ..sensor.image_reader import Source
+from ..sensor.rpc import SensorModel
 from .model import EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, resample
-from .rpc import SensorModel
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -222,12 +222,12 @@ def rectify(
     the model goes. All three products appear when they are whole, or not at all.
 
     Blocks that an earlier call has left, made of the same images by the same model and code, are
-    taken over (see :mod:`stereotruth.products.resumable_grids`). ``strip``: make its blocks only,
-    for a later call without it.
+    taken over (see :mod:`stereotruth.core.products.resumable_grids`). ``strip``: make its blocks
+    only, for a later call without it.
 
     Raises InputError for images that cannot be read or hold nothing but nodata.
     """
-    code = source_digest("epipolar.rectify")
+    code = source_digest("stereotruth.epipolar.rectify")
     with ExitStack() as stack:
         finished = []
         for view, source, image, store in (

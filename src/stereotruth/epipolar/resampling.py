@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, inner, kernel
-from ..numerics.cubic_convolution import (
+from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.cubic_convolution import (
     SIX_POINT_RADIUS,
     six_point_weights,
     six_point_weights_of_row,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, inner, kernel
-from ..numerics.b_spline import cubic_slopes, cubic_weights
-from .rpc import project_block
+from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.b_spline import cubic_slopes, cubic_weights
+from ..sensor.rpc import project_block
 
 Floats = NDArray[np.float64]
 

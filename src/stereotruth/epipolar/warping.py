@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, kernel
-from ..numerics.cubic_convolution import four_point_value
+from ..core.kernels import inlined, kernel
+from ..core.numerics.cubic_convolution import four_point_value
 
 Floats = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, inner, kernel
-from ..numerics.cubic_convolution import four_point_weights
+from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.cubic_convolution import four_point_weights
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

@@ -27,10 +27,10 @@ from pyproj.exceptions import CRSError, ProjError
 from shapely import Geometry
 from shapely.geometry import shape
 
-from ..errors import InputError
-from ..numerics.degrees import continuous
-from ..products.remote_files import SCHEMES, is_remote, read_bytes
-from ..sheets import LIDAR_SEPARATOR, LIDAR_SUFFIXES, RASTER_SUFFIXES
+from ..core.errors import InputError
+from ..core.numerics.degrees import continuous
+from ..core.products.remote_files import SCHEMES, is_remote, read_bytes
+from ..core.sheets import LIDAR_SEPARATOR, LIDAR_SUFFIXES, RASTER_SUFFIXES
 from .catalogue_list import EPT
 from .declared_crs import interpret
 from .footprint import CELL_DEG, Footprint

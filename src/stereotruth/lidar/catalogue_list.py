@@ -20,10 +20,10 @@ from dataclasses import asdict, dataclass, fields
 from datetime import date
 from pathlib import Path
 
-from ..errors import InputError
-from ..products.files import atomic_file
-from ..products.remote_files import is_remote, place_of, stand_in_of
-from ..tables import Table
+from ..core.errors import InputError
+from ..core.products.files import atomic_file
+from ..core.products.remote_files import is_remote, place_of, stand_in_of
+from ..core.tables import Table
 from .footprint import Footprint
 
 SUFFIX = ".tsv"

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..core.kernels import kernel
 from .lattice import CELL_BITS, cell_key
 from .point_store import CELL, CELLS, POINTS, SQUARES, STRIPS, WORDS
 

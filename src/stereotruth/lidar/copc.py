@@ -20,8 +20,8 @@ from laspy.copc import CopcInfoVlr
 from laspy.point.record import PackedPointRecord, ScaleAwarePointRecord
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..products.file_parts import GLANCE_BYTES, LocalParts, open_parts, open_stream
+from ..core.errors import InputError
+from ..core.products.file_parts import GLANCE_BYTES, LocalParts, open_parts, open_stream
 from .las_files import _decoding
 from .las_layout import LAYERED, Layout, Packing, _records, _require, check_layout
 from .octree import BATCH_BYTES, FIELDS, MOST_LEVELS, MOST_NODES, NODE, Octree

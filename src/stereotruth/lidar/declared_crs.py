@@ -16,8 +16,8 @@ import pyproj
 from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
 
-from ..errors import InputError
-from ..numerics.degrees import DEGREE_M
+from ..core.errors import InputError
+from ..core.numerics.degrees import DEGREE_M
 
 VERTICAL_UNITS_KEY = 4099
 LINEAR_UNITS = {  # EPSG code: (name, metres)

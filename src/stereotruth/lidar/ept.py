@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from ..errors import InputError
-from ..products.file_parts import copies_of, kept, open_parts
-from ..products.remote_files import AT_ONCE, hosts_of, read_bytes, url_of
+from ..core.errors import InputError
+from ..core.products.file_parts import copies_of, kept, open_parts
+from ..core.products.remote_files import AT_ONCE, hosts_of, read_bytes, url_of
 from .las_files import _decoding
 from .las_layout import _require
 from .octree import FIELDS, MOST_NODE_POINTS, MOST_NODES, NODE, Octree, shown

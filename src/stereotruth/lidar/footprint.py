@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
-from ..numerics.degrees import DEGREE_M, metres_per_degree
+from ..core.kernels import kernel
+from ..core.numerics.degrees import DEGREE_M, metres_per_degree
 from .lattice import CELL_BITS, LATTICE_DEG
 
 Floats = NDArray[np.float64]

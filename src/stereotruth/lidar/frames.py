@@ -37,8 +37,8 @@ from pyproj.crs import Datum, GeographicCRS
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
-from ..errors import InputError
-from ..numerics.degrees import turn
+from ..core.errors import InputError
+from ..core.numerics.degrees import turn
 from .plate_motion import moved, plate_at, speed
 
 Floats = NDArray[np.float64]

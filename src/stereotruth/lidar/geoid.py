@@ -10,11 +10,11 @@ import rasterio
 from pyproj import CRS
 from rasterio.windows import Window
 
-from ..errors import InputError
-from ..numerics.bilinear import bilinear
-from ..numerics.degrees import metres_per_degree
-from ..products.raster_values import MOST_CELLS, Fills, Quantity, Values
-from ..products.ungeoreferenced import open_raster
+from ..core.errors import InputError
+from ..core.numerics.bilinear import bilinear
+from ..core.numerics.degrees import metres_per_degree
+from ..core.products.raster_values import MOST_CELLS, Fills, Quantity, Values
+from ..core.products.ungeoreferenced import open_raster
 from .declared_crs import of_raster
 
 FORMATS = ("GTX", "GTiff")

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from ..errors import InputError
-from ..numerics.degrees import turn
+from ..core.errors import InputError
+from ..core.numerics.degrees import turn
 
 MOST = 4  # candidates beside the ellipsoid
 ASSUMED = "ellipsoidal (assumed)"  # how stores say that nothing is declared

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..core.kernels import kernel
 
 if TYPE_CHECKING:
     import laspy

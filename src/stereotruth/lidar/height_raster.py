@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 from rasterio.windows import Window as RasterWindow
 
-from ..errors import InputError
-from ..numerics.bilinear import bilinear
-from ..numerics.degrees import exact_metres_per_degree, turn
-from ..products.raster_values import HEIGHT, Fills, Quantity, Values
-from ..products.ungeoreferenced import open_raster
+from ..core.errors import InputError
+from ..core.numerics.bilinear import bilinear
+from ..core.numerics.degrees import exact_metres_per_degree, turn
+from ..core.products.raster_values import HEIGHT, Fills, Quantity, Values
+from ..core.products.ungeoreferenced import open_raster
 from .declared_crs import LidarCRS, of_raster
 from .frames import Epochs
 from .geokeys import epoch_of

@@ -28,9 +28,9 @@ import laspy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..kernels import kernel
-from ..products.files import atomic_folder, sealed
+from ..core.errors import InputError
+from ..core.kernels import kernel
+from ..core.products.files import atomic_folder, sealed
 from .cell_sort import RUN_WORDS, SCRATCH_POINTS, SortedRuns
 from .footprint import Footprint
 from .frames import Epochs

@@ -12,10 +12,10 @@ import numpy as np
 from laspy.header import GpsTimeType
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..kernels import inner, kernel
-from ..products.file_parts import GLANCE_BYTES, STREAM_BYTES, open_stream
-from ..products.remote_files import size_of
+from ..core.errors import InputError
+from ..core.kernels import inner, kernel
+from ..core.products.file_parts import GLANCE_BYTES, STREAM_BYTES, open_stream
+from ..core.products.remote_files import size_of
 from .gps_times import GpsDays
 from .las_layout import check_layout, wrong_count
 from .strip_codes import StripCodes

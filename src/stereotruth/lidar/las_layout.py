@@ -17,9 +17,9 @@ import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..products.file_parts import GLANCE_BYTES, STREAM_BYTES, open_stream
-from ..products.remote_files import size_of
+from ..core.errors import InputError
+from ..core.products.file_parts import GLANCE_BYTES, STREAM_BYTES, open_stream
+from ..core.products.remote_files import size_of
 
 HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}  # by minor version
 RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point data record format

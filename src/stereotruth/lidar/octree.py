@@ -21,7 +21,7 @@ import numpy as np
 from laspy.compression import DecompressionSelection
 from numpy.typing import NDArray
 
-from ..errors import InputError, in_number
+from ..core.errors import InputError, in_number
 
 Floats = NDArray[np.float64]
 Touches = Callable[[Floats, Floats], NDArray[np.bool_]]

@@ -16,8 +16,8 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from ..products.file_parts import open_stream
-from ..products.remote_files import size_of
+from ..core.products.file_parts import open_stream
+from ..core.products.remote_files import size_of
 from . import las_files
 from .copc import Copc
 from .octree import Octree, Touches

@@ -39,10 +39,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..kernels import kernel
-from ..products.files import read_json
-from ..products.provenance import own_digest
+from ..core.errors import InputError
+from ..core.kernels import kernel
+from ..core.products.files import read_json
+from ..core.products.provenance import own_digest
 from .footprint import Footprint
 from .gps_times import Days, days_by_code
 from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box

@@ -22,11 +22,11 @@ import pyproj
 import rasterio
 from rasterio.errors import RasterioError
 
-from ..errors import InputError
-from ..products.file_parts import open_stream
-from ..products.raster_values import HEIGHT, MOST_CELLS, Fills, Values, refuse_bands
-from ..products.remote_files import url_of
-from ..products.ungeoreferenced import open_raster
+from ..core.errors import InputError
+from ..core.products.file_parts import open_stream
+from ..core.products.raster_values import HEIGHT, MOST_CELLS, Fills, Values, refuse_bands
+from ..core.products.remote_files import url_of
+from ..core.products.ungeoreferenced import open_raster
 from .height_raster import refuse_grid, system_of
 
 FORMATS = ("GTiff",)

@@ -1,7 +1,7 @@
 """How rough the ground of a site is, buildings and trees included, by its points.
 
 What stands up looks different from its sides and casts shadows, so that roughness tells how well
-images of a site match: :mod:`stereotruth.epipolar.pair_quality`.
+images of a site match: :mod:`stereotruth.sensor.pair_quality`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..numerics.degrees import metres_per_degree
+from ..core.numerics.degrees import metres_per_degree
 from .lattice import CELL_BITS, LATTICE_DEG
 from .point_store import Points, PointStore, query_points
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..core.kernels import kernel
 
 if TYPE_CHECKING:
     import laspy

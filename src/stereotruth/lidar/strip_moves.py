@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..numerics.degrees import exact_metres_per_degree
-from ..products.files import atomic_folder, sealed
+from ..core.numerics.degrees import exact_metres_per_degree
+from ..core.products.files import atomic_folder, sealed
 from .cell_sort import RUN_WORDS, SCRATCH_POINTS, SortedRuns
 from .ingest import _bounds
 from .las_files import _no_limits

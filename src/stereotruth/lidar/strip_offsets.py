@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..products.files import atomic_folder, read_record, sealed
+from ..core.errors import InputError
+from ..core.products.files import atomic_folder, read_record, sealed
 from .point_store import SQUARES
 
 Floats = NDArray[np.float64]

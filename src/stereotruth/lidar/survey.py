@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..numerics.degrees import DEGREE_M
-from ..products.remote_files import url_of
+from ..core.numerics.degrees import DEGREE_M
+from ..core.products.remote_files import url_of
 from .footprint import Footprint
 from .frames import Epochs
 from .ingest import _bounds, _refuse_coarse, _to_lattice, touching

@@ -41,8 +41,8 @@ from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
-from ..errors import InputError
-from ..numerics.degrees import continuous, turn
+from ..core.errors import InputError
+from ..core.numerics.degrees import continuous, turn
 from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, degrees_of, resolve
 from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
 from .smooth_maps import PatchedTransform

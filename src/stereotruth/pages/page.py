@@ -13,7 +13,7 @@ from typing import Any
 
 import jinja2
 
-from ..products.files import atomic_file
+from ..core.products.files import atomic_file
 from .tables import gate, minus, words
 
 SHARED = Path(__file__).parent  # of what all pages share

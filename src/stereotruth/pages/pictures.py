@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import ArrayLike, NDArray
 
-from ..products.files import atomic_file
+from ..core.products.files import atomic_file
 
 Picture = NDArray[np.uint8]
 

@@ -19,17 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, inner, kernel
+from ..core.kernels import inlined, inner, kernel
 from .delaunay import Triangles
-from .feasible_lines import (
-    MOST_CORNERS,
-    POLYGONS,
-    RINGS,
-    Band,
-    Polygons,
-    Sides,
-    feasible_lines,
-)
+from .feasible_lines import MOST_CORNERS, POLYGONS, RINGS, Band, Polygons, Sides, feasible_lines
 from .scale import BREAKLINE_REACH, PART, SurfaceScale, height_steps
 from .step_points import (
     MOST_STEP_POINTS,

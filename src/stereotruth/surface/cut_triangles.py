@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
+from ..core.kernels import inner, kernel
 from .breaklines import Breaklines
 from .feasible_lines import clip
 from .scale import PART

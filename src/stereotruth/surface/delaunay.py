@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
+from ..core.kernels import inner, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

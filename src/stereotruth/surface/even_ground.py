@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
+from ..core.kernels import inner, kernel
 from .scale import PART, SQUARE_CELLS
 
 Floats = NDArray[np.float64]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
+from ..core.kernels import inner, kernel
 from .delaunay import Triangles
 from .scale import HEIGHT_NOISE_M, PART, PRIOR_NOISE_M, SurfaceScale, height_steps
 from .vertices import Vertices

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, inner
+from ..core.kernels import inlined, inner
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

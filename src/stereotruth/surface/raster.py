@@ -24,10 +24,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.kernels import inner, kernel
+from ..core.numerics.triangles import plane_slopes, row_span
 from ..epipolar.window_sums import SURFACE_PX
-from ..kernels import inner, kernel
 from ..lidar.lattice import LATTICE_M
-from ..numerics.triangles import plane_slopes, row_span
 from .facet_values import Facets, PixelValues, interpolate, triple
 from .surface import GroundSurface
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..core.kernels import kernel
 from .scale import PART_BITS
 from .vertices import Vertices
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
+from ..core.kernels import inner, kernel
 from .delaunay import Triangles, triangulate
 from .scale import ROUGH_REACH, SurfaceScale, height_steps
 from .vertices import Vertices

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..core.numerics.degrees import DEGREE_M
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
-from ..numerics.degrees import DEGREE_M
 
 PART_BITS = 5
 PART = 1 << PART_BITS  # parts of a cell along each axis: 1 cm at pixels of 0.65 m

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inlined, kernel
+from ..core.kernels import inlined, kernel
 from .feasible_lines import STEEPEST, Sides
 from .scale import PART, PART_BITS
 from .vertices import Vertices

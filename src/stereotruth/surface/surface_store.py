@@ -26,10 +26,10 @@ import numpy as np
 from numpy.lib.format import read_array_header_1_0, read_magic
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..kernels import kernel
+from ..core.errors import InputError
+from ..core.kernels import kernel
+from ..core.products.files import read_sealed
 from ..lidar.lattice import LATTICE_DEG
-from ..products.files import read_sealed
 from .region import Region
 from .rough_tops import RoughTops
 from .scale import PART, SurfaceScale

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import inner, kernel
+from ..core.kernels import inner, kernel
 from .even_ground import CellVertices, EvenGround, SquareGrid, even_ground
 from .scale import PART_BITS, SQUARE_CELLS, SurfaceScale, height_steps
 

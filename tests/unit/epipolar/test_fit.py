@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereocities import site_images
+from stereocities.sites import drawn_site
+from stereotruth.core.errors import InputError
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.rpc import RPC, SCALARS, VECTORS, SensorModel
-from stereotruth.epipolar.rpc_files import read_rpc
-from stereotruth.errors import InputError
-from stereotruth.simulate import site_images
-from stereotruth.simulate.sites import drawn_site
+from stereotruth.sensor.rpc import RPC, SCALARS, VECTORS, SensorModel
+from stereotruth.sensor.rpc_files import read_rpc
 
 from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, camera
 from ...synthetic.real_data import MARSEILLE

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereotruth.core.errors import InputError
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.errors import InputError
 
 from ...synthetic.cameras import BACKWARD, FORWARD, LAT, LON, camera
 from ...synthetic.wide_pair import fit, ground

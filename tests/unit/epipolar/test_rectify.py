@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from stereotruth.config.labels import Rectify
+from stereotruth.core.config.labels import Rectify
+from stereotruth.core.errors import InputError
+from stereotruth.core.products.grids import open_grid, require_complete
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.image_reader import Source, open_pair
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.epipolar.rpc import SensorModel
-from stereotruth.errors import InputError
-from stereotruth.products.grids import open_grid, require_complete
+from stereotruth.sensor.image_reader import Source, open_pair
+from stereotruth.sensor.rpc import SensorModel
 
 from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera
 from ...synthetic.images import pattern, write_image

@@ -10,7 +10,9 @@ import pyproj
 import pytest
 import shapely
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
+from stereotruth.core.products import remote_files
+from stereotruth.core.products.remote_files import hosts_of, url_of
 from stereotruth.lidar.catalogue import Tile, cover_of, read_catalogue, resolved
 from stereotruth.lidar.catalogue_list import (
     ListedTile,
@@ -24,8 +26,6 @@ from stereotruth.lidar.catalogue_list import (
     write_list,
 )
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
-from stereotruth.products import remote_files
-from stereotruth.products.remote_files import hosts_of, url_of
 
 WEST, SOUTH = 5.0, 43.0
 SIDE = 0.01

@@ -7,7 +7,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar import declared_crs
 from stereotruth.lidar.las_files import read_header
 

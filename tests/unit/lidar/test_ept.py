@@ -12,7 +12,7 @@ import pyproj
 import pytest
 from scipy.spatial import cKDTree
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar.declared_crs import header_crs, interpret
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest

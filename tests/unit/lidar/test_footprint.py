@@ -9,12 +9,12 @@ import laspy
 import numpy as np
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
+from stereotruth.core.numerics.degrees import metres_per_degree
 from stereotruth.lidar.density import points_per_m2
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore, open_stores, query_points
-from stereotruth.numerics.degrees import metres_per_degree
 
 from ...synthetic.copc_server import CORNER, make_copc
 from ...synthetic.las import SOUTH, UTM, WEST, write_las

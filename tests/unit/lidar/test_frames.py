@@ -16,7 +16,7 @@ import rasterio
 from pyproj import CRS
 from rasterio.transform import from_origin
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar.frames import DEFAULT_EPOCH, Epoch, Epochs, frame_change
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.plate_motion import moved, plate_at, speed

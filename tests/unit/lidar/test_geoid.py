@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar import geoid
 
 from ...synthetic.las import write_gtx

@@ -11,7 +11,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar import lattice
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore

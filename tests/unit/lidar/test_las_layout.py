@@ -9,7 +9,7 @@ from pathlib import Path
 import laspy
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar.las_layout import check_layout
 
 from ...synthetic.las import refused, write_las

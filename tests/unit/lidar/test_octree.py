@@ -13,14 +13,14 @@ import laspy
 import numpy as np
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
+from stereotruth.core.products.file_parts import FOLDER
+from stereotruth.core.products.remote_files import bring_files
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_files import open_octree
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.survey import survey
-from stereotruth.products.file_parts import FOLDER
-from stereotruth.products.remote_files import bring_files
 
 from ...synthetic import object_storage
 from ...synthetic.copc_server import (
@@ -290,7 +290,7 @@ def test_the_store_of_a_bucket_is_that_of_the_disk_and_asked_for_once(bucket, mo
     assert surveyed.read[0] == disk.attrs["points"]["read"]
     assert any(FOLDER.glob("*/*"))
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")  # nobody is asked
-    monkeypatch.setattr("stereotruth.products.remote_files.bucket", None)
+    monkeypatch.setattr("stereotruth.core.products.remote_files.bucket", None)
     ingest(place, "again.points", footprint=ground)
     assert content_of(PointStore("again.points")) == content_of(disk)
 

@@ -10,7 +10,8 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
+from stereotruth.core.numerics.degrees import DEGREE_M
 from stereotruth.lidar import lattice, point_store
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import (
@@ -22,7 +23,6 @@ from stereotruth.lidar.point_store import (
     open_stores,
     query_points,
 )
-from stereotruth.numerics.degrees import DEGREE_M
 
 from ...synthetic.las import SOUTH, WEST, everything, write_las
 

@@ -10,12 +10,12 @@ import pyproj
 import pytest
 from rasterio.transform import Affine
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
+from stereotruth.core.products import raster_values
 from stereotruth.lidar import raster_points
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.survey import survey
-from stereotruth.products import raster_values
 
 from ...synthetic.copc_server import serving
 from ...synthetic.las import FT, SOUTH, US_FT, WEST, everything, refused, write_gtx

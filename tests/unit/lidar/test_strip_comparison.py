@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import STRIPS, PointStore

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.survey import survey
 

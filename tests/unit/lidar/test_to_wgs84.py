@@ -6,7 +6,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
 from stereotruth.lidar import declared_crs, to_wgs84
 
 from ...synthetic.las import FT, NAVD88_FTUS, US_FT, UTM_10, header_of, write_gtx

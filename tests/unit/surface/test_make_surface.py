@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.errors import InputError
+from stereotruth.core.errors import InputError
+from stereotruth.core.products.files import read_sealed
 from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.lattice import LATTICE_DEG
 from stereotruth.lidar.point_store import PointStore, open_stores
-from stereotruth.products.files import read_sealed
 from stereotruth.surface import make_surface as module
 from stereotruth.surface.delaunay import MAX_PARTS
 from stereotruth.surface.make_surface import make_surface

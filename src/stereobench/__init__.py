@@ -1,0 +1,1 @@
+"""Stereo methods on labelled pairs: methods, networks, scores; and audits of stereo datasets."""

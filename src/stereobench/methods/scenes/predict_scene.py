@@ -1,0 +1,359 @@
+"""A stereo method over the rectified images of a whole scene, in blocks that outlive their job.
+
+Work goes in two rounds over the grid, both kept as :mod:`stereotruth.core.products.resumable_grids`
+keeps blocks: the method makes the tiles (:mod:`stereobench.methods.scenes.tiling`), side by
+side in a grid of their own, one to a file; then the blocks are blended from the tiles that reach
+into them. Memory is that of the tiles at work. A job that was killed goes on with the tiles that
+lack; the result has the same bytes for any number of workers and kills, as far as the method itself
+gives the same for the same tile (SGM does; PyTorch does on one machine).
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import dask.threaded
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from stereotruth.core.config.methods import CHUNK, SceneMatching
+from stereotruth.core.errors import InputError
+from stereotruth.core.job import block_progress
+from stereotruth.core.products.grids import Layer, require_complete
+from stereotruth.core.products.provenance import describe, digest, file_sha256
+from stereotruth.core.products.resumable_grids import BlockStore, resumable_grid
+
+from ..kinds import kind_of, names_of
+from ..matcher import Matcher
+from ..methods import make_method
+from .offsets import Offsets, find_offsets
+from .tiling import Tiling, blend, inside, predict_tile, view_of
+
+log = logging.getLogger("stereotruth")
+DisparityRange = tuple[int, int]
+Place = tuple[int, int]
+Window = tuple[slice, slice]
+
+
+LAYERS = {
+    "disparity": Layer(
+        "float32",
+        float("nan"),
+        {
+            "units": "px",
+            "long_name": "disparity x_left - x_right by a stereo method",
+            "nodata": "NaN",
+        },
+    )
+}
+
+
+def identity(entry: Mapping[str, Any], files: Sequence[Path]) -> str:
+    """Digest of a method's configuration entry and of its files' content."""
+    return digest({"settings": dict(entry), "files": [file_sha256(path) for path in files]})
+
+
+def _image_content(attrs: Mapping[str, Any]) -> str:
+    return attrs.get("content") or digest(dict(attrs.get("provenance", {})))
+
+
+@dataclass(frozen=True, eq=False)
+class _ImagePair:
+    """What every tile needs: plain values, so that it can go to another process."""
+
+    left_store: Path
+    right_store: Path
+    method: str
+    entry: Mapping[str, Any]
+    threads: int  # of the method
+    disparity_range: DisparityRange
+    tiling: Tiling
+    margin: int | None
+    scaling: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in self.__dataclass_fields__}
+
+    @cached_property
+    def images(self) -> tuple[zarr.Array, zarr.Array]:
+        stores = (self.left_store, self.right_store)
+        left, right = (require_complete(path)["image"] for path in stores)
+        if left.shape != right.shape:
+            raise InputError(
+                f"left image of {left.shape} px, right image of {right.shape}",
+                file=self.right_store,
+                remedy="run rectify again",
+            )
+        return left, right
+
+    @cached_property
+    def matcher(self) -> Matcher:
+        return make_method(self.method, self.entry, self.threads)
+
+    def tile(self, out: BlockStore, key: str, place: Place, offset: int) -> None:
+        """Predict one tile and write it to its place in the grid of tiles."""
+        window = self.tiling.tile_window(place)
+        matcher, shape = self.matcher, self.tiling.shape
+        margin = matcher.margin_px if self.margin is None else self.margin
+        view = view_of(shape, window, margin, self.disparity_range, offset)
+        left, right = self.images
+        found = predict_tile(
+            matcher,
+            inside(left, view.left),
+            inside(right, view.right),
+            view,
+            self.tiling,
+            place,
+            self.disparity_range,
+            offset,
+            self.scaling,
+        )
+        arrays = {"disparity": found} if np.isfinite(found).any() else {}
+        out.write(self._stored(place), key, arrays, None)
+
+    def block(self, tiles: BlockStore, out: BlockStore, key: str, place: Place) -> None:
+        """Blend one block; its result: count of valid pixels, least and greatest disparity."""
+        stored = zarr.open_group(tiles.store, mode="r")["disparity"]
+        around = {other: stored[self._stored(other)] for other in self.tiling.around(place)}
+        found = blend(self.tiling, place, around)
+        valid = np.isfinite(found)
+        arrays, result = {}, [0, None, None]
+        if valid.any():
+            arrays = {"disparity": found}
+            result = [int(valid.sum()), *(float(f(found[valid])) for f in (np.min, np.max))]
+        out.write(self.tiling.block_window(place), key, arrays, result)
+
+    def _stored(self, place: Place) -> Window:
+        side = self.tiling.side
+        return tuple(slice(k * side, (k + 1) * side) for k in place)
+
+
+def _fixed(offset: Any, tiling: Tiling) -> Offsets:
+    offsets = np.full(tiling.count, int(offset), dtype=np.int64)
+    return Offsets(offsets, np.ones(tiling.count, np.bool_), 1.0, np.ones(tiling.count))
+
+
+def _search(attrs: Mapping[str, Any]) -> DisparityRange | None:
+    """The disparities of the heights that the epipolar model is made for, with some reserve."""
+    try:
+        low, high = attrs["epipolar"]["report"]["disparity_range_px"]
+    except (KeyError, TypeError):
+        return None
+    reserve = 0.1 * (high - low) + 64.0
+    return int(np.floor(low - reserve)), int(np.ceil(high + reserve))
+
+
+def _run(
+    work: Callable[..., None],
+    arguments: Sequence[tuple[Any, ...]],
+    what: str,
+    scheduler: Any,
+    workers: int,
+) -> None:
+    """Do the work with each of the arguments, by Dask; ``what`` names it in the log."""
+    tasks = [
+        dask.delayed(work, pure=False)(*given, dask_key_name=f"{what}-{number:07d}")
+        for number, given in enumerate(arguments)
+    ]
+    with block_progress(len(tasks), what):
+        dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
+
+
+def predict_scene(
+    left_store: str | Path,
+    right_store: str | Path,
+    out: str | Path,
+    *,
+    method: str,
+    entry: Mapping[str, Any],
+    settings: SceneMatching,
+    workers: int = 1,
+    scheduler: Any = dask.threaded.get,
+    code: str = "",
+    scene: str = "",
+) -> dict[str, Any]:
+    """Write the disparity of a scene by a method as a Zarr grid; returns its summary.
+
+    ``left_store``, ``right_store``: rectified images as `rectify` makes them. ``method``: a name
+    for messages; ``entry``: its configuration entry (:func:`..methods.make_method`).
+    ``settings``: how the method goes over the scene, with a disparity range.
+    ``workers`` tiles are worked on at once by SGM, while networks and functions get that many
+    threads. ``scheduler`` is what Dask's compute takes. ``code``: digest of the source, for the
+    provenance.
+
+    The store [y, x] on the left epipolar grid: ``disparity`` (:data:`LAYERS`); attributes
+    ``epipolar`` (the model), ``block_offsets_px`` [n][m], ``summary`` (valid share, least and
+    greatest disparity, px), ``settings``, ``provenance``.
+
+    Raises InputError for images that nowhere match, and settings that the method does not take.
+    """
+    left_store, right_store, out = (Path(p).absolute() for p in (left_store, right_store, out))
+    kind = kind_of(method, entry)
+    left_attrs, right_attrs = (
+        dict(require_complete(path).attrs) for path in (left_store, right_store)
+    )
+    shape = require_complete(left_store)["image"].shape
+    start = _ImagePair(
+        left_store,
+        right_store,
+        method,
+        dict(entry),
+        threads=1 if kind.tiles_at_once else workers,
+        disparity_range=tuple(settings.disparity_range),
+        tiling=Tiling(shape, settings.block_px, settings.overlap_px),
+        margin=settings.margin_px,
+    )
+    moved = _offsets(start, settings, left_attrs)
+    job = replace(start, scaling=start.matcher.scaling(*_lazy(*start.images)))
+    parameters = _parameters(job, settings)
+    files = [file for file in kind.files(entry) if file.is_file()]
+    content = digest(
+        {
+            "images": [_image_content(attrs) for attrs in (left_attrs, right_attrs)],
+            "method": identity(entry, files),
+            "range": parameters["disparity_range"],
+            "margin": parameters["margin_px"],
+            "tiling": [settings.block_px, settings.overlap_px],
+            "code": code,
+        }
+    )
+    plan = _Plan.of(job.tiling, content, moved)
+    with resumable_grid(out, shape, LAYERS, chunk=CHUNK, shard=settings.block_px) as unfinished:
+        tiles = _make_blocks(job, plan, unfinished, out, (scheduler, workers))
+        summary = _summary(unfinished.results(plan.windows), shape, moved)
+        inputs = {
+            name: digest(dict(attrs.get("provenance", {})))
+            for name, attrs in (("left", left_attrs), ("right", right_attrs))
+        }
+        inputs |= {name: file_sha256(path) for name, path in names_of(files).items()}
+        attrs = {
+            "kind": "prediction",
+            "scene": scene,
+            "view": "left",
+            "epipolar": left_attrs.get("epipolar"),
+            "settings": parameters,
+            "block_offsets_px": moved.offsets.tolist(),
+            "summary": summary,
+            "provenance": describe(inputs, parameters, code),
+        }
+        unfinished.write_atomically(out, plan.windows, attrs)
+        shutil.rmtree(tiles.folder, ignore_errors=True)
+    log.info(
+        "%s: %.1f %% of the grid has a disparity, %.0f to %.0f px",
+        method,
+        100.0 * summary["valid_share"],
+        summary["disparity_min_px"],
+        summary["disparity_max_px"],
+    )
+    return summary
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Blocks of a scene and the tiles that they are blended from, with the keys of both.
+
+    ``offsets``: of the right image, px, by place; ``keys`` and ``windows`` go with ``places``.
+    """
+
+    tiling: Tiling
+    offsets: NDArray[np.int64]
+    places: list[Place]
+    windows: list[Window]
+    keys: list[str]
+    tile_keys: dict[Place, str]
+
+    @classmethod
+    def of(cls, tiling: Tiling, content: str, moved: Offsets) -> _Plan:
+        """By a digest of all that the disparities follow from but the offsets."""
+        places = list(tiling.places())
+        tile_keys = {
+            p: digest({"content": content, "offset": int(moved.offsets[p])}) for p in places
+        }
+        keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
+        windows = [tiling.block_window(place) for place in places]
+        return cls(tiling, moved.offsets, places, windows, keys, tile_keys)
+
+
+def _offsets(pair: _ImagePair, settings: SceneMatching, attrs: Mapping[str, Any]) -> Offsets:
+    """By how much the right image is moved for each block."""
+    if settings.offset != "auto":
+        return _fixed(settings.offset, pair.tiling)
+    return find_offsets(*pair.images, pair.tiling, pair.disparity_range, _search(attrs))
+
+
+def _parameters(job: _ImagePair, settings: SceneMatching) -> dict[str, Any]:
+    """What a prediction follows from besides its files, for its record."""
+    return {
+        "method": job.method,
+        "method_settings": dict(job.entry),
+        "disparity_range": list(job.disparity_range),
+        "block_px": settings.block_px,
+        "overlap_px": settings.overlap_px,
+        "offset": settings.offset,
+        "margin_px": job.matcher.margin_px if job.margin is None else job.margin,
+    }
+
+
+def _make_blocks(
+    job: _ImagePair, plan: _Plan, blocks: BlockStore, out: Path, by: tuple[Any, int]
+) -> BlockStore:
+    """Make the blocks that are missing, and the tiles that these need; the store of the tiles.
+
+    ``by``: Dask's scheduler and its workers, which make one tile at a time if the method itself has
+    several threads.
+    """
+    scheduler, workers = by
+    tiling, places = plan.tiling, plan.places
+    shape = tuple(n * tiling.side for n in tiling.count)
+    sizes = {"chunk": tiling.side, "shard": tiling.side}
+    missing = blocks.missing(plan.windows, plan.keys, workers)
+    with resumable_grid(out.with_name(f"{out.name}.tiles"), shape, LAYERS, **sizes) as tiles:
+        wanted = sorted({p for k in missing for p in tiling.around(places[k])})
+        wanted_keys = [plan.tile_keys[p] for p in wanted]
+        stored = [job._stored(p) for p in wanted]
+        todo = [wanted[k] for k in tiles.missing(stored, wanted_keys, workers)]
+        _run(
+            job.tile,
+            [(tiles, plan.tile_keys[p], p, int(plan.offsets[p])) for p in todo],
+            f"tiles by {job.method}",
+            scheduler,
+            workers if job.threads == 1 else 1,
+        )
+        _run(
+            job.block,
+            [(tiles, blocks, plan.keys[k], places[k]) for k in missing],
+            "blending",
+            scheduler,
+            workers,
+        )
+    return tiles
+
+
+def _lazy(*images: zarr.Array) -> list[Any]:
+    import dask.array as da
+
+    return [da.from_zarr(image) for image in images]
+
+
+def _summary(results: Sequence[Sequence[Any]], shape: tuple[int, int], moved: Offsets) -> dict:
+    count = sum(result[0] for result in results)
+    if not count:
+        raise InputError(
+            "the method gave no disparity at all", remedy="check its disparity range and offset"
+        )
+    return {
+        "valid_share": round(count / (shape[0] * shape[1]), 6),
+        "disparity_min_px": min(result[1] for result in results if result[0]),
+        "disparity_max_px": max(result[2] for result in results if result[0]),
+        "offset_min_px": int(moved.offsets.min()),
+        "offset_max_px": int(moved.offsets.max()),
+        "blocks_without_offset_of_their_own": int((~moved.known).sum()),
+        "coarse_disparities_in_range": round(moved.in_range, 6),
+    }

@@ -1,0 +1,207 @@
+"""Where things are in a city: its frame, scenes, extent, zones of land use, LiDAR coverage.
+
+Each zone has its grid of blocks and streets. A scene's LiDAR reaches beyond its image on two sides,
+and ends inside it on the others.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stereotruth.core.kernels import inlined
+
+from .cities import LEFT_GSD_M, CitySpec, SceneSpec
+from .geodesy import LocalFrame
+from .surfaces import CELL_M, Surfaces, terrain_heights
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+
+def frame_of(city: CitySpec) -> LocalFrame:
+    """The city's world frame."""
+    return LocalFrame(city.lon, city.lat, city.base_height_m)
+
+
+def image_axes(city: CitySpec, scene: SceneSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Nominal plan directions [2] in which the columns and rows of the left image run.
+
+    From the orbit's inclination and the Earth's turning; the real image is within a degree.
+    """
+    latitude = math.radians(city.lat)
+    azimuth = math.asin(math.cos(math.radians(97.4)) / math.cos(latitude))
+    if not scene.ascending:
+        azimuth = math.pi - azimuth
+    run = 7040 * np.array([math.sin(azimuth), math.cos(azimuth)])
+    run[0] -= 465 * math.cos(latitude)
+    run /= np.hypot(*run)
+    return np.array([-run[1], run[0]]), run
+
+
+def scene_coordinates(city: CitySpec, scene: SceneSpec, xy: np.ndarray) -> np.ndarray:
+    """Plan positions [n, 2] in metres from the scene's middle, along columns and rows."""
+    across, along = image_axes(city, scene)
+    local = np.atleast_2d(xy) - np.array(scene.centre_m)
+    return np.column_stack([local @ across, local @ along])
+
+
+def half_size(scene: SceneSpec) -> np.ndarray:
+    """Half the ground size (m) of the left image, along columns and rows."""
+    return np.array([scene.cols, scene.rows]) * LEFT_GSD_M / 2
+
+
+def near_scenes(city: CitySpec, xy: np.ndarray, margin: float) -> np.ndarray:
+    """Which plan positions [n, 2] lie in a scene or within ``margin`` metres of one."""
+    near = np.zeros(len(xy), bool)
+    for scene in city.scenes:
+        inside = np.abs(scene_coordinates(city, scene, xy)) < half_size(scene) + margin
+        near |= inside.all(axis=1)
+    return near
+
+
+def extent(city: CitySpec) -> tuple[float, float, float, float]:
+    """(x_min, y_min, x_max, y_max) of the world, whole cells."""
+    corners = []
+    for scene in city.scenes:
+        across, along = image_axes(city, scene)
+        a, b = half_size(scene) + city.margin_m
+        corners += [
+            np.array(scene.centre_m) + i * a * across + j * b * along
+            for i in (-1, 1)
+            for j in (-1, 1)
+        ]
+    low = np.floor(np.min(corners, axis=0) / CELL_M) * CELL_M
+    high = np.ceil(np.max(corners, axis=0) / CELL_M) * CELL_M
+    return low[0], low[1], high[0], high[1]
+
+
+ZONE_KINDS = (
+    "towers", "slabs", "lowrise", "village", "industry", "park", "fields", "forest", "bare",
+)  # fmt: skip
+BUILT = ZONE_KINDS[:5]
+# block length, block width, half width of the street (m) of each kind of land use
+BLOCKS = {
+    "towers": (118, 98, 8.5), "slabs": (124, 92, 6.0), "lowrise": (86, 62, 4.0),
+    "village": (64, 50, 2.2), "industry": (176, 122, 6.5), "park": (150, 110, 2.5),
+    "fields": (96, 38, 1.2), "forest": (400, 400, 1.0), "bare": (400, 400, 1.0),
+}  # fmt: skip
+
+
+def draw_zones(
+    city: CitySpec, rng: np.random.Generator, s: Surfaces
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, cKDTree]:
+    """Land use: zones, the zone of each cell, those that meet in a cell, and the sites as a tree.
+
+    Zones are float64[n, 9]: x, y, cos, sin, block length, width, half street, kind, tone. A place
+    is of the zone with the nearest site. Cells where several meet have −1 − k in place of a zone,
+    and row k of what is third holds those that a place in the cell can be of, then −1.
+    """
+    c = city.character
+    ny, nx = s.cell_top.shape
+    width, height = nx * CELL_M, ny * CELL_M
+    columns, rows = max(2, round(width / c.zone_m)), max(2, round(height / c.zone_m))
+    jj, ii = np.mgrid[0:rows, 0:columns]
+    xy = np.column_stack([(ii.ravel() + 0.5) * width / columns, (jj.ravel() + 0.5) * height / rows])
+    xy += rng.uniform(-0.36, 0.36, xy.shape) * [width / columns, height / rows]
+    xy += [s.x0, s.y0]
+    around = np.concatenate([xy + d for d in ((0, 0), (70, 0), (-70, 0), (0, 70), (0, -70))])
+    t = terrain_heights(s, around)
+    slope = np.hypot(t[:, 1], t[:, 2]).reshape(5, -1).mean(axis=0)
+    kinds = list(c.zones)
+    zones = np.zeros((len(xy), 9))
+    zones[:, :2] = xy
+    city_angle = rng.uniform(-0.3, 0.3)
+    centre = np.mean([q.centre_m for q in city.scenes], axis=0)
+    for n in range(len(xy)):
+        weights = np.array([c.zones[k] for k in kinds], dtype=float)
+        urban = math.exp(-np.hypot(*(xy[n] - centre)) / 1100)
+        for m, kind in enumerate(kinds):
+            if kind in ("towers", "slabs", "lowrise", "industry"):
+                weights[m] *= 0.35 + 1.6 * urban
+                if slope[n] > 0.12:
+                    weights[m] = 0
+            elif kind in ("village", "fields", "park"):
+                weights[m] *= 1 if slope[n] < 0.22 else 0.02
+            else:
+                weights[m] *= 0.35 if slope[n] < 0.1 else 3
+        kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
+        length, block, street = BLOCKS[kind]
+        loose = 0.5 if kind in ("village", "fields", "park") else 0.08
+        angle = city_angle + rng.uniform(-loose, loose)
+        grow = rng.uniform(0.9, 1.12)
+        zones[n, 2:] = (
+            math.cos(angle), math.sin(angle), length * grow, block * grow, street,
+            ZONE_KINDS.index(kind), rng.random(),
+        )  # fmt: skip
+    from scipy.spatial import cKDTree  # slow to import, and most jobs draw no zones
+
+    sites = cKDTree(xy)
+    corner_x = s.x0 + CELL_M * np.arange(nx + 1)
+    corner_y = s.y0 + CELL_M * np.arange(ny + 1)
+    nearest = sites.query(
+        np.stack(np.meshgrid(corner_x, corner_y), axis=-1).reshape(-1, 2)
+    )[1].reshape(ny + 1, nx + 1)  # fmt: skip
+    same = (
+        (nearest[:-1, :-1] == nearest[1:, 1:])
+        & (nearest[1:, :-1] == nearest[:-1, 1:])
+        & (nearest[:-1, :-1] == nearest[:-1, 1:])
+    )
+    border_y, border_x = np.nonzero(~same)
+    middles = np.column_stack([
+        s.x0 + CELL_M * (border_x + 0.5), s.y0 + CELL_M * (border_y + 0.5)
+    ])  # fmt: skip
+    # no place is farther than half a diagonal from its cell's middle; 1 mm for rounding
+    reach = sites.query(middles)[0] + CELL_M * math.sqrt(2) + 1e-3
+    meeting = sites.query_ball_point(middles, reach, return_sorted=True)
+    near = np.full((len(middles), max(map(len, meeting), default=0)), -1, np.int32)
+    for row, found in zip(near, meeting):
+        row[: len(found)] = found
+    cells = nearest[:-1, :-1].astype(np.int32)
+    cells[~same] = -1 - np.arange(len(middles))
+    return zones, cells, near, sites
+
+
+def coverage(city: CitySpec, scene: SceneSpec) -> np.ndarray:
+    """Packed outline float64[21] of a scene's LiDAR coverage, see :func:`covered`.
+
+    It reaches beyond the image at the first columns and last rows, and ends inside it, raggedly,
+    at the last columns and first rows, with a block missing in the corner between them. That of a
+    twin is a rectangle.
+    """
+    if city.twin is not None:  # what the file covers, and not the image's margin around it
+        cos, sin = math.cos(city.twin.turned_rad), math.sin(city.twin.turned_rad)
+        outline = [0.0, 0.0, cos, sin, -sin, cos, *city.twin.half_m]
+        return np.array([*outline, *np.zeros(13)])
+    across, along = image_axes(city, scene)
+    rng = np.random.default_rng([scene.pose_seed, 6])
+    beyond = 35.0 + 0.12 * city.character.relief_m
+    return np.array([
+        *scene.centre_m, *across, *along, *half_size(scene), beyond, *scene.ragged_m,
+        *rng.uniform(0, 2 * np.pi, 6), *scene.gap_m, *rng.uniform(0, 2 * np.pi, 2),
+    ])  # fmt: skip
+
+
+@inlined
+def covered(c, x, y):
+    """Whether a plan position lies in the LiDAR coverage."""
+    dx, dy = x - c[0], y - c[1]
+    a, b = dx * c[2] + dy * c[3], dx * c[4] + dy * c[5]
+    if a < -c[6] - c[8] or b > c[7] + c[8]:
+        return False
+    # the waves below stay within these factors: most points need no sine
+    if a < c[6] - 1.95 * c[9] and b > -c[7] + 1.95 * c[10]:
+        inside = True
+    else:
+        edge_a = 1 + 0.5 * math.sin(b / 150 + c[11]) + 0.3 * math.sin(b / 61 + c[12])
+        edge_a += 0.15 * math.sin(b / 19 + c[13])
+        edge_b = 1 + 0.5 * math.sin(a / 170 + c[14]) + 0.3 * math.sin(a / 53 + c[15])
+        edge_b += 0.15 * math.sin(a / 17 + c[16])
+        inside = a <= c[6] - c[9] * edge_a and b >= -c[7] + c[10] * edge_b
+    if not inside or a < c[6] - 1.07 * c[17] or b > -c[7] + 1.07 * c[18]:
+        return inside
+    gap_a = c[17] * (1 + 0.05 * math.sin(b / 90 + c[19]) + 0.02 * math.sin(b / 23))
+    gap_b = c[18] * (1 + 0.05 * math.sin(a / 80 + c[20]) + 0.02 * math.sin(a / 21))
+    return a < c[6] - gap_a or b > -c[7] + gap_b

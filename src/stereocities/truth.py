@@ -1,0 +1,266 @@
+"""The exact truth of a scene: what each pixel shows, and where the other image has it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import zarr
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
+
+from stereotruth.core.job import progress
+from stereotruth.core.kernels import inlined, kernel
+from stereotruth.core.products.grids import PlainStore, atomic_store
+
+from .camera import direction, pose, project_point
+from .cities import CitySpec, SceneSpec
+from .dated_worlds import world_of
+from .geodesy import LocalFrame, world_to_geodetic_point
+from .layout import coverage, covered
+from .render import Camera, in_collar, prepare
+from .surfaces import GROUND, IN_LIDAR, NONE, WATER, Surfaces, cast, stands_in, terrain_at
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+log = logging.getLogger("stereotruth")
+
+
+CHUNK = 512
+SEEN_TOLERANCE_M = 0.02
+SURFACES = "none ground roof wall tree water"
+CHANGES = "unchanged in_lidar_only in_images_only"
+LAYERS = {
+    "lon": ("float64", "degrees_east", "WGS 84 longitude of the surface point"),
+    "lat": ("float64", "degrees_north", "WGS 84 latitude of the surface point"),
+    "height": ("float64", "m", "WGS 84 ellipsoidal height of the surface point"),
+    "right_col": ("float64", "px", "column of the surface point in the right image"),
+    "right_row": ("float64", "px", "row of the surface point in the right image"),
+    "visible_right": ("uint8", "1", "1 where the right image shows the surface point"),
+    "hidden_right": (
+        "uint8",
+        "1",
+        "1 where the surface point lies in the right frame, behind something",
+    ),
+    "surface": ("uint8", "1", "kind of surface that the pixel shows"),
+    "changed": ("uint8", "1", "whether the pixel would show another surface in the LiDAR's world"),
+    "changed_right": (
+        "uint8",
+        "1",
+        "1 where the LiDAR's world is unchanged, but hides the point from the right view and that "
+        "of the images does not, or the other way round",
+    ),
+    "covered": ("uint8", "1", "1 inside the LiDAR coverage"),
+}
+FLAGS = {"surface": SURFACES, "changed": CHANGES}
+REALS = [name for name, (dtype, _, _) in LAYERS.items() if dtype == "float64"]
+
+
+class Views(NamedTuple):
+    """Both images: the ``first``, in which positions lie, and the ``second``.
+
+    Each of: its camera; what may stand above the ground (``above``); the bit of what it shows
+    (``shown``); the kind of its ``collar``. ``size``: cols, rows of the first, cols, rows of the
+    second.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    above_first: np.ndarray
+    above_second: np.ndarray
+    shown_first: int
+    shown_second: int
+    collar_first: int
+    collar_second: int
+    size: np.ndarray
+
+
+@inlined
+def seen_from(s, above, x, y, z, line, view, tolerance):
+    """Whether nothing hides a world point from the position in ``line``, a camera's pose."""
+    depth = line[2] - z
+    bx, by = (line[0] - x) / depth, (line[1] - y) / depth
+    hit, kind, _, _, _, _, _ = cast(s, above, x - bx * z, y - by * z, bx, by, view, True, z)
+    return kind != NONE and hit <= z + tolerance
+
+
+@inlined
+def _lies_lower(s, kind, x, y, z):
+    """Whether ground or water of a world lies lower than a point of another world's."""
+    if kind != GROUND and kind != WATER:
+        return False
+    ground, _, _ = terrain_at(s, x, y)
+    return max(ground, s.water) < z - SEEN_TOLERANCE_M
+
+
+@kernel
+def _truth_points(s, other_s, scanned_s, views, frame, cover, image_col, image_row, real, flags):
+    """The truth at positions [n] of the first of two ``views``; neighbours follow each other.
+
+    ``s``, ``other_s``, ``scanned_s``: the worlds of the first image, the second, and the LiDAR.
+
+    real[5, n] and flags[6, n]: values of LAYERS in their order. Positions outside the first
+    frame, in its collar, or NaN get NaN and 0.
+    """
+    left, right, above_left, above_right, shown, shown_there, collar, collar_there, size = views
+    line, other = np.empty(12), np.empty(12)
+    guess = 0.0
+    right_row = 0.5 * size[3]
+    posed = np.nan
+    for k in range(image_col.size):
+        c, row = image_col[k], image_row[k]
+        if not (
+            c >= -0.5 and row >= -0.5 and c <= size[0] - 0.5 and row <= size[1] - 0.5
+        ) or in_collar(collar, c, row, size[0], size[1]):
+            real[:, k] = np.nan
+            flags[:, k] = 0
+            continue
+        if row != posed:
+            pose(left, row, line)
+            posed = row
+        dx, dy, dz = direction(left, line, c)
+        bx, by = dx / dz, dy / dz
+        ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
+        z, kind, index, _, ground, _, _ = cast(s, above_left, ax, ay, bx, by, shown, True, guess)
+        guess = ground
+        x, y = ax + bx * z, ay + by * z
+        lon, lat, height = world_to_geodetic_point(frame, x, y, z)
+        col, right_row = project_point(right, x, y, z, right_row, other)
+        free = seen_from(other_s, above_right, x, y, z, other, shown_there, SEEN_TOLERANCE_M)
+        inside = (
+            col >= 0
+            and right_row >= 0
+            and col <= size[2] - 1
+            and right_row <= size[3] - 1
+            and not in_collar(collar_there, col, right_row, size[2], size[3])
+        )
+        there = inside and stands_in(other_s, kind, index, shown_there, z)
+        there = there and not _lies_lower(other_s, kind, x, y, z)
+        scanned, _, _, _, _, _, _ = cast(
+            scanned_s, above_left, ax, ay, bx, by, IN_LIDAR, True, ground
+        )
+        changed = 1 if scanned > z + 0.01 else (2 if scanned < z - 0.01 else 0)
+        real[0, k], real[1, k], real[2, k] = lon, lat, height
+        real[3, k], real[4, k] = col, right_row
+        flags[0, k] = free and there
+        flags[1, k] = there and not free
+        flags[2, k] = kind
+        flags[3, k] = changed
+        flags[4, k] = (
+            changed == 0
+            and inside
+            and seen_from(scanned_s, above_right, x, y, z, other, IN_LIDAR, SEEN_TOLERANCE_M)
+            != free
+        )
+        flags[5, k] = covered(cover, x, y)
+
+
+def truth_at(
+    city: CitySpec, scene: SceneSpec, col: np.ndarray, row: np.ndarray, view: str = "left"
+) -> dict[str, np.ndarray]:
+    """The layers of LAYERS at positions (col, row) of the left image, px, of any one shape.
+
+    Rays go through the very positions given, by the rigorous camera. Where the left image shows
+    nothing (outside its frame, in its collar, NaN) the layers hold NaN and 0. With the ``view``
+    "right", positions are of the right image, and the layers named right tell of the left one.
+    """
+    ready = prepare(city, scene)
+    cameras = (ready.left, ready.right) if view == "left" else (ready.right, ready.left)
+    scanned = world_of(city, ready.surfaces, "lidar")
+    return truth_between(cameras, scanned, ready.frame, coverage(city, scene), col, row)
+
+
+def truth_between(
+    cameras: tuple[Camera, Camera],
+    scanned: Surfaces,
+    frame: LocalFrame,
+    cover: np.ndarray,
+    col: np.ndarray,
+    row: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """The layers of LAYERS at positions (col, row) of the first of two images of one city.
+
+    What is called right is the second image. ``scanned``: the LiDAR's world. ``cover``: of
+    :func:`.layout.coverage`.
+    """
+    first, second = cameras
+    size = np.array([first.cols, first.rows, second.cols, second.rows], dtype=np.float64)
+    at = [np.ascontiguousarray(a, dtype=np.float64).ravel() for a in (col, row)]
+    real = np.empty((len(REALS), at[0].size))
+    flags = np.empty((len(LAYERS) - len(REALS), at[0].size), np.uint8)
+    views = Views(
+        first.cam,
+        second.cam,
+        first.horizon,
+        second.horizon,
+        first.shown,
+        second.shown,
+        first.collar,
+        second.collar,
+        size,
+    )
+    worlds = first.surfaces, second.surfaces, scanned
+    _truth_points(*worlds, views, frame.packed(), cover, *at, real, flags)
+    return dict(zip(LAYERS, (values.reshape(np.shape(col)) for values in (*real, *flags))))
+
+
+def simulate_truth(city: CitySpec, scene: SceneSpec, out_zarr: str | Path) -> dict[str, float]:
+    """Write the truth on the raw left image's grid [row, col], one array per layer of LAYERS.
+
+    Pixels of the collar hold NaN and 0. Longitudes and latitudes are rounded to 2^-33 degrees
+    (13 µm), heights and image coordinates to 2^-20: far below any use, and they pack well. Returns
+    the shares of pixels that are visible, hidden and changed.
+    """
+    left = prepare(city, scene).left
+    totals = np.zeros(3)
+    with atomic_store(out_zarr) as scratch:
+        group = zarr.open_group(PlainStore(scratch), mode="w", zarr_format=3)
+        group.attrs.update({
+            "conventions": "arrays are [row, col] of the left image; pixel (0, 0) is the centre "
+            "of the upper-left pixel",
+            "scene": scene.name,
+        })  # fmt: skip
+        arrays = {}
+        for name, (dtype, units, long_name) in LAYERS.items():
+            attributes = {"units": units, "long_name": long_name}
+            if name in FLAGS:
+                values = list(range(len(FLAGS[name].split())))
+                attributes |= {"flag_values": values, "flag_meanings": FLAGS[name]}
+            arrays[name] = group.create_array(
+                name, shape=(left.rows, left.cols), dtype=dtype, chunks=(CHUNK, CHUNK),
+                fill_value=np.nan if dtype == "float64" else 0,
+                compressors=(
+                    BloscCodec(cname="zstd", clevel=1, shuffle=BloscShuffle.shuffle),
+                    Crc32cCodec(),
+                ),
+                dimension_names=("row", "col"), attributes=attributes,
+            )  # fmt: skip
+        strips = range(0, left.rows, CHUNK)
+        steps = {"lon": 2.0**33, "lat": 2.0**33}
+        for first in progress(strips, len(strips), f"{scene.name} truth"):
+            rows = slice(first, min(first + CHUNK, left.rows))
+            row, col = np.mgrid[rows, 0 : left.cols].astype(np.float64)
+            found = truth_at(city, scene, col, row)
+            for name in REALS:
+                step = steps.get(name, 2.0**20)
+                found[name] = np.rint(found[name] * step) / step
+            for name, values in found.items():
+                arrays[name][rows] = values
+            shown = found["surface"] > 0
+            seen = found["visible_right"] > 0
+            totals += [(seen & shown).sum(), (shown & ~seen).sum(), (found["changed"] > 0).sum()]
+    shares = totals / (left.cols * left.rows)
+    log.info(
+        "%s: the right image shows %.1f %% of the left's pixels, not %.1f %%; %.2f %% changed",
+        scene.name, *(100 * shares),
+    )  # fmt: skip
+    return dict(zip(("visible", "hidden", "changed"), map(float, shares)))
+
+
+def open_truth(path: str | Path) -> xr.Dataset:
+    """The truth of a scene as a lazy xarray Dataset on dimensions (row, col)."""
+    import xarray as xr  # a quarter of a job's start-up, and the job that makes it needs none
+
+    return xr.open_zarr(path, consolidated=True, chunks=None)

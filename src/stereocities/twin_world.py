@@ -1,0 +1,221 @@
+"""Twins of real places: a city whose surfaces follow from the points of a LAS or LAZ file.
+
+What is made of the points is the truth: images, LiDAR and truth of a twin look at one and the same
+ground, roofs and crowns, and the points of the file are never seen again.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stereotruth.core.errors import InputError
+
+from .appearance import PAINT
+from .cities import LEFT_GSD_M, Character, CitySpec, SceneSpec, Twin
+from .dated_worlds import dated_patches
+from .geodesy import LocalFrame
+from .layout import draw_zones, extent, frame_of, image_axes
+from .patches import PATCHES_A_CELL, greatest
+from .rpcs import read_rpc
+from .surfaces import CELL_M, Surfaces, terrain_heights
+from .twin_points import Points, extent_of, read_points
+from .twin_surfaces import (
+    OBJECT_M,
+    STEP_M,
+    Crowns,
+    Planes,
+    buildings_of,
+    crowns_of,
+    is_ground,
+    is_leaf,
+    planes_of,
+    rasterised,
+    terrain_of,
+    thinned,
+)
+
+log = logging.getLogger("stereotruth")
+
+ROOF_LIGHT = 0.1, 0.5  # reflectance of roofs where the points tell none
+GROUND_M = 0.7  # one point of the ground at most in a square of this side paints it
+
+
+def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, Crowns]:
+    """The surfaces of a twin but for its crowns, and these.
+
+    ``empty``: surfaces of the city's extent where nothing stands. Raises InputError if the file
+    has no ground, or no points in the scenes.
+    """
+    frame, box = frame_of(city), extent(city)
+    points = read_points(city.twin, frame)
+    inside = (points.xyz[:, :2] > box[:2]) & (points.xyz[:, :2] < box[2:])
+    points = points.which(inside.all(axis=1))
+    if not len(points.xyz):
+        raise InputError(
+            "has no points in the scene", file=city.twin.file, remedy="make the scene larger"
+        )
+    low = is_ground(points)
+    if not low.any():
+        raise InputError(
+            "has no points on the ground", file=city.twin.file, remedy="name a place's points"
+        )
+    shape = tuple(int((box[k + 2] - box[k]) / STEP_M) + 6 for k in (1, 0))
+    terrain = terrain_of(points.xyz[low], box[0], box[1], shape)
+    rng = np.random.default_rng([city.world_seed, 10])
+    s = empty._replace(step=STEP_M, terrain=terrain)
+    zones, zone_cells, zone_near, _ = draw_zones(city, rng, s)
+    s = s._replace(zones=zones, zone_cells=zone_cells, zone_near=zone_near)
+    ground = terrain_heights(s, points.xyz[:, :2])[:, 0]
+    high = ~low & (points.xyz[:, 2] > ground + OBJECT_M)
+    leaf = is_leaf(points.which(high))
+    leaves, roofs = np.flatnonzero(high)[leaf], np.flatnonzero(high)[~leaf]
+    roofs = roofs[thinned(points.xyz[roofs])]
+    low = np.flatnonzero(low)
+    low = low[thinned(points.xyz[low], GROUND_M)]
+    found = planes_of(points.xyz[roofs])
+    tint = _tints(points, found, roofs, low, rng)
+    first = np.floor((points.xyz[:, :2].min(axis=0) - box[:2]) / CELL_M).astype(int)
+    last = np.floor((points.xyz[:, :2].max(axis=0) - box[:2]) / CELL_M).astype(int) + 1
+    raster = rasterised(
+        found, points.xyz[roofs], points.xyz[low], tint, tuple(box[:2] + CELL_M * first),
+        tuple(PATCHES_A_CELL * (last - first)[::-1]),
+    )  # fmt: skip
+    crowns = crowns_of(points.which(leaves), ground[leaves], rng)
+    log.info(
+        "%s: %d roof planes over %.0f m², %d crown tops",
+        city.name, len(found.plane), (raster.roof >= 0).sum() * (CELL_M / PATCHES_A_CELL) ** 2,
+        len(crowns.ellipsoids),
+    )  # fmt: skip
+    s = s._replace(
+        patches=raster.patches, patch_side=raster.side,
+        patch_building=buildings_of(raster.roof, rng), patch_i=int(first[0]),
+        patch_j=int(first[1]), paint=np.rint(raster.paint * PAINT).astype(np.uint16),
+    )  # fmt: skip
+    return s, crowns
+
+
+def _tints(
+    points: Points, found: Planes, roofs: np.ndarray, low: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reflectance of the points on roofs and on the ground.
+
+    Where the file tells none, it is drawn for each roof, and the ground (0) has no paint.
+    """
+    if points.tint is not None:
+        return points.tint[roofs], points.tint[low]
+    drawn = np.append(rng.uniform(*ROOF_LIGHT, len(found.plane)), 0.0)
+    return drawn[found.number], np.zeros(len(low))
+
+
+def patch_tops(city: CitySpec, s: Surfaces) -> np.ndarray:
+    """Greatest z of the patches in each cell of a city at any date, as its ``cell_top``."""
+    top = np.full(s.cell_top.shape, -1e9)
+    if not s.patches.size:
+        return top
+    rows, cols = (n // PATCHES_A_CELL for n in s.patches.shape[:2])
+    highest = greatest(s.patches.astype(np.float64))
+    if city.dates is not None:
+        for passed in (0.0, 1.0):
+            of = dated_patches(city, s, passed)
+            highest = np.maximum(highest, greatest(of.astype(np.float64)))
+    cells = highest.reshape(rows, PATCHES_A_CELL, cols, PATCHES_A_CELL)
+    # rays are not followed where a cell ends: what is left over for rounding
+    top[s.patch_j : s.patch_j + rows, s.patch_i : s.patch_i + cols] = cells.max(axis=(1, 3)) + 1e-3
+    return top
+
+
+MARGIN_PX = 30  # of the left image around the points
+MOST_PX = 3200  # a side of 2 km: the patches of a twin take some 4 GB while it is built
+SUN_DEG = (148.0, 54.0)
+# Land use is what the ground looks like where the file tells nothing of it; all else is the file's.
+CHARACTER = Character(
+    relief_m=0.0, valley=0.0, wavelength_m=0.0, max_slope_deg=0.0, river_m=0.0, lakes=0.0,
+    zones={"slabs": 2.0, "lowrise": 2.0, "village": 1.0, "park": 1.5}, towers_m=(0.0, 0.0),
+    trees=0.0, zone_m=200.0,
+)  # fmt: skip
+
+
+def twin_city(
+    name: str,
+    file: str | Path,
+    *,
+    crs: str = "",
+    size_px: tuple[int, int] | None = None,
+    sun_deg: tuple[float, float] = SUN_DEG,
+    rpcs: tuple[str | Path, str | Path] | None = None,
+    pose_seed: int = 1,
+) -> CitySpec:
+    """The twin of the place whose points a LAS or LAZ file has, with its one scene ``name``-1.
+
+    ``crs``: of a file that declares none. ``size_px``: columns and rows of the left image, about
+    the middle of the place; None: all of it. ``sun_deg``: azimuth and elevation. ``rpcs``: of
+    the left and the right image, instead of GaoFen-7's camera; images have the size that the place
+    has in them then. ``pose_seed`` draws orbit, attitude and the bias of the RPCs. Heights are
+    taken as ellipsoidal. Raises InputError of :func:`.twin_points.extent_of` and
+    :func:`.given_rpcs.read_rpc`.
+    """
+    of = extent_of(file, crs)
+    low, high = of.low, of.high
+    middle = (low + high) / 2
+    lon, lat, _ = of.to_geodetic(middle[None])[0]
+    if not (abs(lon) <= 360 and abs(lat) <= 90):
+        raise InputError(
+            f"lies outside of what {of.crs.name} covers",
+            file=file,
+            remedy="give the coordinate system of the points, as --crs EPSG:2154",
+        )
+    base = math.floor(of.unit_m * low[2])
+    frame = LocalFrame(float(lon), float(lat), float(base))
+    ends = np.array([[high[0], middle[1], low[2]], [middle[0], high[1], low[2]]])
+    right, up = frame.from_geodetic(of.to_geodetic(ends))[:, :2]
+    half = float(np.hypot(*right)), float(np.hypot(*up))
+    if not min(half) > 0:
+        raise InputError("covers no ground", file=file, remedy="name a file of a place's points")
+    scene = SceneSpec(
+        f"{name}-1", (0.0, 0.0), 0, 0, pose_seed, lidar_grid=(1, 1), ragged_m=(0.0, 0.0)
+    )
+    city = CitySpec(
+        name,
+        lon=float(lon),
+        lat=float(lat),
+        epsg=(32601 if lat >= 0 else 32701) + int((lon + 180.0) // 6.0),
+        base_height_m=float(base),
+        world_seed=pose_seed,
+        character=CHARACTER,
+        scenes=(scene,),
+        sun_azimuth_deg=sun_deg[0],
+        sun_elevation_deg=sun_deg[1],
+        twin=Twin(str(file), crs, half, math.atan2(right[1], right[0]), _read_once(rpcs)),
+    )
+    cols, rows = size_px or _all_of_it(city, scene, right, up)
+    if max(cols, rows) > MOST_PX:
+        raise InputError(
+            f"would be {cols} x {rows} px of {LEFT_GSD_M} m, and {MOST_PX} are the most",
+            file=file,
+            remedy="give a part of it about its middle, as --size 2000 2000, or cut the file",
+        )
+    return replace(city, scenes=(replace(scene, cols=cols, rows=rows),))
+
+
+def _read_once(rpcs: tuple[str | Path, str | Path] | None) -> tuple[str, str] | None:
+    """The names of files of RPCs that can be read."""
+    if rpcs is None:
+        return None
+    left, right = (str(read_rpc(file).file) for file in rpcs)
+    return left, right
+
+
+def _all_of_it(
+    city: CitySpec, scene: SceneSpec, right: np.ndarray, up: np.ndarray
+) -> tuple[int, int]:
+    """Columns and rows of a left image that shows all points; half axes ``right``, ``up`` [2]."""
+    sides = []
+    for axis in image_axes(city, scene):
+        reach = abs(float(axis @ right)) + abs(float(axis @ up))
+        sides.append(math.ceil(2 * reach / LEFT_GSD_M) + 2 * MARGIN_PX)
+    return sides[0], sides[1]

@@ -1,0 +1,403 @@
+"""What is refused of ground control points before and after the fit, naming file and remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from pyproj.exceptions import ProjError
+from rasterio.errors import RasterioError
+
+from ..core.errors import InputError, in_number
+from ..core.numerics.degrees import metres_per_degree, turn
+from ..core.products.ungeoreferenced import open_raster
+from ..sensor.rpc import SensorModel
+from ..sensor.rpc_files import read_rpc, rpc_file
+from .control_points import ControlPoints, TooFewPoints
+from .robust_fit import MINIMAL, System
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+# One more than determines the model is asked for: with fewer, no residual tells of an error.
+NEEDED = {model: n + 1 for model, n in MINIMAL.items()}
+MAX_LEFT_OUT = 1 / 3  # share of blunders beyond which nobody knows which points are right
+MAX_SIGMA = 5.0  # px: beyond, GCPs and image do not belong together
+UNCHECKED_SIGMA = 3.0  # px, where there are too few GCPs to find the blunder among them
+MAX_TILT = 0.05  # beyond, columns and rows are mixed up
+MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
+MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
+PIXEL_M = (0.01, 1000.0)  # m on the ground
+PIXEL_RATIO = 2.0  # of the largest and smallest in an image, over the heights of its RPC
+GRID_SHIFT_M = 100.0  # between an image's map grid and its RPC: rounded corners and a loose RPC
+GRID_BENT = 0.01  # of the image's diagonal likewise, without the shift
+FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One view's input: rows of the GCP table that it sees, and where."""
+
+    name: str
+    image: Path
+    size: tuple[int, int]
+    sensor: SensorModel
+    index: NDArray[np.intp]
+    predicted: Floats
+    measured: Floats
+
+
+def _some(ids: Sequence[str]) -> str:
+    return ", ".join(ids[:6]) + (f" and {len(ids) - 6} more" if len(ids) > 6 else "")
+
+
+def _spreads(points: Floats) -> tuple[float, float]:
+    """Standard deviations in px of points [n, 2] along their main axis and across it."""
+    if len(points) < 2:
+        return 0.0, 0.0
+    values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
+    return float(values[0]), float(values[1])
+
+
+def _defect(model: str, points: Floats) -> str:
+    """Why GCPs at these positions [n, 2] cannot carry the model, or an empty string."""
+    n, (along, across) = len(points), _spreads(points)
+    if n < NEEDED[model]:
+        return (
+            f"{in_number(n, 'GCP')}, the model {model!r} needs {NEEDED[model]} "
+            f"({MINIMAL[model]} determine it, one more shows an error)"
+        )
+    if model == "shift":
+        return ""
+    if along < MIN_SPREAD:
+        return f"GCPs within {2 * along:.1f} px of one spot, too close for the model {model!r}"
+    if model == "affine" and across < MIN_WIDTH_RATIO * along:
+        return (
+            f"GCPs along one line ({along:.0f} px deviation along, {across:.1f} px across), which "
+            "does not determine an affine"
+        )
+    return ""
+
+
+def _remedy(model: str, points: Floats) -> str:
+    """What to do about a defect, naming the models that these points can carry."""
+    simpler = list(MINIMAL)[list(MINIMAL).index(model) + 1 :]
+    carried = [other for other in simpler if not _defect(other, points)]
+    more = "measure more GCPs, spread over the image"
+    if not carried:
+        return more
+    names = " or ".join(repr(name) for name in carried)
+    return f"{more}, or set alignment.model to {names}, which these GCPs can carry"
+
+
+def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, int]]:
+    """The RPC of an image and its size (cols, rows).
+
+    Raises InputError: unreadable, or an RPC that does not see the ground by the image's pixels.
+    """
+    sensor = SensorModel(read_rpc(image))
+    try:
+        with open_raster(image) as dataset:
+            size = dataset.width, dataset.height
+            apart = _apart_of_grid(dataset, sensor)
+    except RasterioError as error:
+        raise InputError(
+            f"cannot be opened as the {name} image{of} ({error})",
+            file=image,
+            remedy="check the file",
+        ) from None
+    if apart:
+        raise InputError(
+            f"the {name} image {image.name} is on a map grid and has an RPC, which put its pixels "
+            f"{apart:.0f} m apart: it was map-projected, or cut, and kept the RPC from before{of}",
+            file=image,
+            remedy="give the image as the sensor saw it, with its RPC; if it is that, take the "
+            "grid away (gdal_edit.py -unsetgt -a_srs '')",
+        )
+    if defect := _blindness(sensor, size):
+        raise InputError(
+            f"the RPC of the {name} image {image.name} cannot be right: {defect}{of}",
+            file=rpc_file(image),
+            remedy="check that RPC and image belong together, and get the RPC again from the "
+            "image's supplier",
+        )
+    return sensor, size
+
+
+def _apart_of_grid(dataset: Any, sensor: SensorModel) -> float:
+    """Metres by which an image's map grid and its RPC contradict each other; 0 if they do not.
+
+    Images that were projected to a plane (ortho-ready) have RPCs of their own, which agree with the
+    grid at one height. Corners of NITF are rounded to a second of arc: GRID_SHIFT_M is allowed.
+    """
+    if dataset.crs is None or dataset.transform == dataset.transform.identity():
+        return 0.0
+    try:
+        to_degrees = pyproj.Transformer.from_crs(dataset.crs.to_wkt(), 4326, always_xy=True)
+    except ProjError:
+        return 0.0
+    axes = (np.linspace(0, n - 1, 5) for n in (dataset.width, dataset.height))
+    col, row = (v.ravel() for v in np.meshgrid(*axes))
+    lon, lat = to_degrees.transform(*(dataset.transform * (col + 0.5, row + 0.5)))
+    best = np.inf, np.inf
+    for share in np.linspace(-1.0, 1.0, 21):
+        height = sensor.rpc.height_off + share * sensor.rpc.height_scale
+        at = np.array(sensor.localize(col, row, height)) - (lon, lat)
+        east, north = np.stack([turn(at[0]), at[1]]) * metres_per_degree(lat)
+        whole = np.hypot(east, north)
+        bent = np.hypot(east - east.mean(), north - north.mean())
+        if np.isfinite(whole).all():
+            best = min(best, (float(np.sqrt(np.mean(whole**2))), float(np.sqrt(np.mean(bent**2)))))
+    east, north = (np.ptp(v) for v in np.array([lon, lat]) * metres_per_degree(lat))
+    is_other = best[0] > GRID_SHIFT_M or best[1] > GRID_BENT * np.hypot(east, north)
+    return best[0] if is_other and np.isfinite(best[0]) else 0.0
+
+
+def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
+    """Why an RPC cannot be that of an image of this size, or an empty string."""
+    rpc = sensor.rpc
+    cols, rows = (np.linspace(0, n - 1, 3) for n in size)
+    heights = rpc.height_off + rpc.height_scale * np.array([0.0, -1.0, 1.0])
+    height, row, col = (a.reshape(3, 9) for a in np.meshgrid(heights, rows, cols, indexing="ij"))
+    lon, lat = sensor.localize(col, row, height)
+    if not np.isfinite([lon[0], lat[0]]).all():
+        return "lines of sight through its middle and corners do not meet the ground"
+    sides = []
+    for step in ((1.0, 0.0), (0.0, 1.0)):
+        there = np.array(sensor.localize(col + step[0], row + step[1], height)) - (lon, lat)
+        side = np.hypot(*(there * metres_per_degree(lat)))
+        sides.append(side[np.isfinite(side)])
+        if not (PIXEL_M[0] <= sides[-1].min() and sides[-1].max() <= PIXEL_M[1]):
+            return f"its pixels would be {sides[-1].min():.3g} to {sides[-1].max():.3g} m long"
+        if sides[-1].max() > PIXEL_RATIO * sides[-1].min():
+            return (
+                f"its pixels would be {sides[-1].min():.3g} m long here and "
+                f"{sides[-1].max():.3g} m there"
+            )
+    west, south, east, north, low, high = rpc.ground_box
+    axes = (np.linspace(*ends, 5) for ends in ((west, east), (south, north), (low, high)))
+    terms = rpc.denominators(*(axis.reshape(-1) for axis in np.meshgrid(*axes)))
+    if (terms.min(axis=1) * terms.max(axis=1) <= 0).any():
+        return "a denominator vanishes within its own ground box"
+    return ""
+
+
+def footprint(sensor: SensorModel, size: tuple[int, int]) -> Floats:
+    """(lon_min, lat_min, lon_max, lat_max) of an image over its RPC's heights, widened by half."""
+    heights = np.array([-1.0, 0.0, 1.0]) * abs(sensor.rpc.height_scale) + sensor.rpc.height_off
+    col, row, height = np.meshgrid([0, size[0] - 1], [0, size[1] - 1], heights)
+    lon, lat = sensor.localize(col, row, height)
+    if not np.isfinite(lon).any():
+        box = sensor.rpc.ground_box
+        low, high = np.array(box[:2]), np.array(box[2:4])
+    else:
+        low = np.array([np.nanmin(lon), np.nanmin(lat)])
+        high = np.array([np.nanmax(lon), np.nanmax(lat)])
+    margin = (high - low) / 2 + 0.01
+    return np.concatenate([low - margin, high + margin])
+
+
+def _in_box(box: Floats, lon: Floats, lat: Floats) -> Bools:
+    turns = np.round((lon - (box[0] + box[2]) / 2) / 360.0)
+    lon = lon - 360.0 * turns
+    return (lon >= box[0]) & (lon <= box[2]) & (lat >= box[1]) & (lat <= box[3])
+
+
+def check_ground(
+    points: ControlPoints, boxes: Sequence[Floats], images: Sequence[Path], of: str
+) -> Bools:
+    """bool[n]: near either image's footprint (``boxes``, left and right).
+
+    Refuses the file if most points are elsewhere, an RPC if it is alone with its ground.
+    """
+    inside = [_in_box(box, points.lon, points.lat) for box in boxes]
+    near = np.any(inside, axis=0)
+    measured = points.in_left, points.in_right
+    shares = [
+        float(np.mean(here[seen])) if seen.any() else 1.0 for here, seen in zip(inside, measured)
+    ]
+    if min(shares) == 0.0 and max(shares) > 0.5:
+        wrong = int(np.argmin(shares))
+        box = boxes[wrong]
+        raise InputError(
+            f"this RPC leads to ground about lon {(box[0] + box[2]) / 2:.4f}, lat "
+            f"{(box[1] + box[3]) / 2:.4f}; the other image and the GCPs are elsewhere{of}",
+            file=rpc_file(images[wrong]),
+            remedy="check that RPC and image belong together, and the image to this scene",
+        )
+    if 2 * near.sum() > len(near):
+        return near
+    swapped = np.any([_in_box(box, points.lat, points.lon) for box in boxes], axis=0)
+    low, high = boxes[0][:2], boxes[0][2:]
+    where = (
+        f"lon {np.median(points.lon):.4f}, lat {np.median(points.lat):.4f} in the middle, while "
+        f"the left image shows about lon {(low[0] + high[0]) / 2:.4f}, "
+        f"lat {(low[1] + high[1]) / 2:.4f}"
+    )
+    if 2 * swapped.sum() > len(near):
+        raise InputError(
+            f"lon and lat of the GCPs seem to be swapped: {where}{of}",
+            file=points.file,
+            remedy="exchange the columns lon and lat",
+        )
+    raise InputError(
+        f"the GCPs lie far from the ground that the images show: {where}{of}",
+        file=points.file,
+        remedy="check that the file is that of this scene, and its coordinates WGS 84 degrees",
+    )
+
+
+def check_heights(points: ControlPoints, sensor: SensorModel) -> str:
+    """A warning if heights leave the RPC's range by more than half of it, else nothing."""
+    low, high = sensor.rpc.ground_box[4:]
+    margin = (high - low) / 4
+    outside = (points.height < low - margin) | (points.height > high + margin)
+    if not outside.any():
+        return ""
+    ids = [name for name, out in zip(points.ids, outside) if out]
+    return (
+        f"heights of {_some(ids)} are outside the {low:.0f} to {high:.0f} m of the RPC: are they "
+        "ellipsoidal metres?"
+    )
+
+
+def misfits_of_sides(
+    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools | None = None
+) -> tuple[float, float]:
+    """How far GCPs miss a pair as it is given, and with both images exchanged, px.
+
+    Median distance from the median shift, the worse of both images; NaN of fewer than three GCPs
+    (``near`` [n], default all) that both images show.
+    """
+    both = points.in_left & points.in_right
+    both = both if near is None else both & near
+    if both.sum() < 3:
+        return np.nan, np.nan
+    ground = points.lon[both], points.lat[both], points.height[both]
+    projected = [np.stack(sensor.project(*ground), axis=1) for sensor in sensors]
+
+    def misfit(measured: tuple[Floats, Floats]) -> float:
+        worst = 0.0
+        for there, here in zip(projected, measured):
+            delta = here - there
+            worst = max(worst, float(np.median(np.hypot(*(delta - np.median(delta, axis=0)).T))))
+        return worst
+
+    left, right = points.left[both], points.right[both]
+    return misfit((left, right)), misfit((right, left))
+
+
+def fit_exchanged(given: float, exchanged: float) -> bool:
+    """Whether GCPs with these misfits (px) belong to the pair with left and right exchanged."""
+    return given > 10.0 and exchanged < given / 5
+
+
+def check_swapped(
+    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools, of: str
+) -> None:
+    """Refuse a pair whose GCPs fit only with left and right exchanged."""
+    given, exchanged = misfits_of_sides(points, sensors, near)
+    if fit_exchanged(given, exchanged):
+        raise InputError(
+            "left_image and right_image seem to be swapped in the scenes sheet: the GCPs miss by "
+            f"{given:.0f} px as given, by {exchanged:.1f} px with the two exchanged{of}",
+            file=points.file,
+            remedy="exchange the columns left_image and right_image of this scene; left is the "
+            "backward view (or exchange the left and right columns of the GCP file, if it is that)",
+        )
+
+
+def check_frame(points: ControlPoints, view: View, of: str) -> None:
+    """Refuse measurements outside the image."""
+    limit = np.array(view.size) - 0.5 + FRAME_MARGIN
+    outside = ~((view.measured >= -0.5 - FRAME_MARGIN) & (view.measured <= limit)).all(axis=1)
+    if outside.any():
+        first = int(np.flatnonzero(outside)[0])
+        name = points.ids[view.index[first]]
+        others = int(outside.sum()) - 1
+        col, row = view.measured[first]
+        raise InputError(
+            f"GCP {name} (line {points.line[view.index[first]]}) is measured at col {col:.1f}, row "
+            f"{row:.1f}, outside the {view.name} image {view.image.name} of {view.size[0]} x "
+            f"{view.size[1]} px (cols x rows)" + (f", and {others} more" if others else "") + of,
+            file=points.file,
+            remedy="correct the measurement, or leave both cells empty where the image does not "
+            "show the point",
+        )
+
+
+def _where(view: View) -> str:
+    """The view's name, with the files that may be at fault beside the GCPs."""
+    rpc = rpc_file(view.image)
+    beside = "" if rpc == view.image else f" (RPC: {rpc.name})"
+    return f"{view.name} image {view.image.name}{beside}"
+
+
+def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: str) -> None:
+    """Refuse a view whose used GCPs cannot carry the model."""
+    defect = _defect(model, view.predicted[used])
+    if not defect:
+        return
+    out = [points.ids[i] for i in view.index[~used]]
+    rest = f" after {_some(out)} were left out" if out else ""
+    raise TooFewPoints(
+        f"{_where(view)}: {defect}{rest}{of}",
+        file=points.file,
+        remedy=_remedy(model, view.predicted[used]),
+    )
+
+
+def refuse_misfit(
+    model: str, view: View, system: System, points: ControlPoints, used: Bools, of: str
+) -> float:
+    """Refuse GCPs that contradict each other; sigma0 in px of those used."""
+    n, kept = len(used), int(used.sum())
+    redundancy = 2 * kept - system.design.shape[2]
+    residuals = system.residuals(system.solve(used))[used]
+    sigma = float(np.sqrt(np.sum(residuals**2) / redundancy))
+    where = _where(view)
+    if n - kept > MAX_LEFT_OUT * n:
+        out = [points.ids[i] for i in view.index[~used]]
+        raise InputError(
+            f"{where}: {len(out)} of {n} GCPs contradict the others ({_some(out)}){of}",
+            file=points.file,
+            remedy="check these GCPs, and that the file belongs to these images and their RPCs",
+        )
+    if n <= system.minimal + 2 and sigma > UNCHECKED_SIGMA:
+        delta = system.delta
+        far = np.hypot(*(delta - np.median(delta, axis=0)).T)
+        suspect = points.ids[view.index[int(np.argmax(far))]]
+        raise InputError(
+            f"{where}: the {n} GCPs contradict each other by {sigma:.1f} px, and so few do not "
+            f"tell which is wrong ({suspect} differs most from the others' shift){of}",
+            file=points.file,
+            remedy=f"check {suspect} first; measure more GCPs: among "
+            f"{system.minimal + 3} or more a blunder is found and left out",
+        )
+    if sigma > MAX_SIGMA:
+        raise InputError(
+            f"{where}: the GCPs do not fit the image (sigma {sigma:.1f} px after the {model} "
+            f"correction){of}",
+            file=points.file,
+            remedy="check that GCP file, image and RPC belong together, and that heights are "
+            "metres above the ellipsoid",
+        )
+    if (change := tilt(system.affine(system.solve(used)))) > MAX_TILT:
+        raise InputError(
+            f"{where}: the GCPs ask for a change of scale or angle by {100 * change:.0f} %{of}",
+            file=points.file,
+            remedy="check that columns count from the left and rows from the top, and that GCP "
+            "file, image and RPC belong together",
+        )
+    return sigma
+
+
+def tilt(affine: Floats) -> float:
+    """Largest relative change of a distance by the linear part of an affine."""
+    return float(np.linalg.norm(affine[:, :2] - np.eye(2), ord=2))

@@ -1,0 +1,273 @@
+"""Doubts about the LiDAR's heights: by the control points, by the images, and by the RPCs.
+
+A fault of the vertical datum (geoid left out or added twice, feet for metres, another zero) moves
+the LiDAR along the vertical, which the images see as a shift of both, each along its own line of
+sight. Three witnesses can tell it: the heights of the control points; the tie points, against what
+the alignment's uncertainty allows; and without control points the RPCs, whose errors have no
+reason to look like a fault of heights. Nothing else in the data can: with a pair of RPCs that are
+off by an unknown amount, a common vertical shift is a change of both images like any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, chdtri, ndtri, stdtrit
+
+from ..core.numerics.degrees import metres_per_degree
+from ..core.numerics.robust import robust_sigma
+from ..lidar.lattice import PER_M
+from ..lidar.point_store import PointStore, query_points
+from ..sensor.rpc import SensorModel
+from .adjustment import Estimate
+from .align import CAREFUL_SIGMA
+from .aligned_pair import Alignment, GcpResidual
+
+Floats = NDArray[np.float64]
+
+
+LIDAR_SIGMA_M = 0.15  # m, vertical: what airborne surveys promise against their control
+LIDAR_PLAN_M = 0.3  # m, of east and of north: what they promise in plan
+FAR_OFF = 4.0  # deviations that no point of the LiDAR around a control point may lie off it
+CHANCE = 1e-4  # probability that heights without a fault are doubted by the tie points
+CHANCE_OF_RPCS = 0.01  # the same, of scenes that nothing but their RPCs can tell about
+AROUND = 12  # points around a control point that are looked at, or all
+WIDEST_M = 5.0  # within this, or none
+FEWEST_GCPS = 3
+MODEL_MARGIN_M, MODEL_MARGIN = 10.0, 0.1  # m, and share of the LiDAR's span: what rises above it
+
+
+@dataclass(frozen=True)
+class HeightOffset:
+    """The LiDAR's height minus that of the images, m.
+
+    ``sigma_m``: standard uncertainty, the LiDAR's own and that of the alignment before the
+    refinement counted; ``told_from_m``: a fault of less is not told from these.
+    """
+
+    offset_m: float
+    sigma_m: float
+    told_from_m: float
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether it is more than the uncertainties explain."""
+        return abs(self.offset_m) > self.told_from_m
+
+
+def control_points_of(alignment: Alignment) -> list[GcpResidual]:
+    """The control points that either view uses, by their ids."""
+    used = {g.id: g for fit in alignment.fits for g in fit.gcps if g.used}
+    return [used[name] for name in sorted(used)]
+
+
+def heights_of_model(
+    stores: Sequence[PointStore], sensors: Sequence[SensorModel]
+) -> tuple[float, float] | None:
+    """Over which heights (ellipsoidal m) an epipolar model serves: the LiDAR's, and a margin.
+
+    None where all of the LiDAR is outside the RPCs' heights; a stray point that is has no say.
+    """
+    low = min(int(store.cell_heights.min()) for store in stores) / PER_M
+    high = max(int(store.cell_heights.max()) for store in stores) / PER_M
+    margin = MODEL_MARGIN_M + MODEL_MARGIN * (high - low)
+    for sensor in sensors:
+        lowest, highest = sensor.rpc.ground_box[4:]
+        spare = (highest - lowest) / 4
+        low, high = max(low, lowest - spare), min(high, highest + spare)
+    return (round(low - margin, 3), round(high + margin, 3)) if low <= high else None
+
+
+def _heights_around(
+    stores: Sequence[PointStore], gcp: GcpResidual, reach_m: float
+) -> NDArray[np.float64]:
+    """Heights m of the points within ``reach_m`` of a control point, or of the AROUND nearest.
+
+    None where there are fewer within WIDEST_M.
+    """
+    metres = metres_per_degree(gcp.lat)
+    widest = max(WIDEST_M, reach_m)
+    east, north = widest / metres
+    points = query_points(stores, gcp.lon - east, gcp.lat - north, gcp.lon + east, gcp.lat + north)
+    distance = np.hypot((points.lon - gcp.lon) * metres[0], (points.lat - gcp.lat) * metres[1])
+    distance, height = distance[distance <= widest], points.height[distance <= widest]
+    if distance.size < AROUND:
+        return np.empty(0)
+    return height[distance <= max(reach_m, np.partition(distance, AROUND - 1)[AROUND - 1])]
+
+
+def pixel_m(alignment: Alignment) -> float:
+    """Size of a pixel of the left image on the ground, m."""
+    cols, rows = alignment.left_fit.size
+    ends = [
+        np.array(alignment.left.localize(cols / 2 + step, rows / 2, alignment.reference_height))
+        for step in (-0.5, 0.5)
+    ]
+    return float(np.hypot(*(ends[1] - ends[0]) * metres_per_degree(ends[0][1])))
+
+
+def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float) -> str:
+    """A sentence if most control points lie on no point of the LiDAR, else nothing.
+
+    A control point on a roof's corner has ground beside it: any of the points around may be the
+    one that it stands for. ``pixel``: size on the ground, m; a measurement is good to a part of it.
+    """
+    tolerance = FAR_OFF * float(np.hypot(LIDAR_SIGMA_M, CAREFUL_SIGMA[0] * pixel))
+    around = [_heights_around(stores, gcp, pixel) - gcp.height for gcp in gcps]
+    around = [differences for differences in around if differences.size]
+    if len(around) < FEWEST_GCPS:
+        return ""
+
+    def agreeing(shift: float) -> int:
+        return sum(bool((np.abs(d - shift) <= tolerance).any()) for d in around)
+
+    here = agreeing(0.0)
+    if 2 * here >= len(around):
+        return ""
+    candidates = np.unique(np.round(np.concatenate(around) / tolerance)) * tolerance
+    counts = np.array([agreeing(shift) for shift in candidates])
+    best = int(np.argmax(counts))
+    near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
+    shift = float(np.median([np.median(d) for d in near if d.size]))
+    from ..lidar.geoid_candidates import ASSUMED, fits  # PROJ, which few refinements need
+
+    declared = not any(s.attrs["crs"]["heights"].startswith(ASSUMED) for s in stores)
+    place = [float(np.median([getattr(gcp, name) for gcp in gcps])) for name in ("lon", "lat")]
+    cause = (
+        f"{counts[best]} would if it were {abs(shift):.1f} m "
+        f"{'lower' if shift > 0 else 'higher'}; check the LiDAR's vertical datum and unit (geoid, "
+        "feet), and that the points' heights are ellipsoidal"
+        if 2 * counts[best] > len(around)
+        else "at no other height would most of them; check the LiDAR's coordinate system and "
+        "height unit"
+    )
+    text = (
+        f"only {here} of {len(around)} ground control points have a LiDAR point within "
+        f"{tolerance:.1f} m of their height: {cause}"
+    )
+    if declared or 2 * counts[best] <= len(around):
+        return text
+    explained = fits(shift, *place)
+    return f"{text}; {explained}" if explained else text
+
+
+def doubt_by_rpcs(stores: Sequence[PointStore], sensors: Sequence[SensorModel]) -> str:
+    """A sentence if most of the LiDAR is outside an RPC's heights by more than a quarter."""
+    heights = np.concatenate([s.cell_heights.mean(axis=1) for s in stores]) / PER_M
+    counts = np.concatenate([s.cell_counts for s in stores])
+    for sensor in sensors:
+        low, high = sensor.rpc.ground_box[4:]
+        margin = (high - low) / 4
+        outside = (heights < low - margin) | (heights > high + margin)
+        if 2 * counts[outside].sum() > counts.sum():
+            return (
+                f"most of the LiDAR, at {np.median(heights):.0f} m, is outside the {low:.0f} to "
+                f"{high:.0f} m of the RPC: are its heights ellipsoidal metres?"
+            )
+    return ""
+
+
+def lines_of_sight(alignment: Alignment) -> Floats:
+    """[2, 2] px: how far a metre of height moves a point in the middle of the left image.
+
+    In the left and the right image, (col, row).
+    """
+    cols, rows = alignment.left_fit.size
+    height = alignment.reference_height
+    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+    moved = []
+    for sensor in (alignment.left, alignment.right):
+        ends = [np.array(sensor.project(lon, lat, height + z)) for z in (-5.0, 5.0)]
+        moved.append((ends[1] - ends[0]) / 10.0)
+    return np.array(moved)
+
+
+def scatter_by_heights(alignment: Alignment, along: Floats, across: Floats) -> tuple[float, float]:
+    """Scatter of disparity residuals (px) of tie points, and what of it is explained at most.
+
+    ``along``, ``across`` [n] px: residuals along and across the rows. Both have the scatter of the
+    matches; that along the rows has the LiDAR's heights besides. At a wrong place of the ground
+    the heights of tie points have nothing to do with what the images show there.
+    """
+    px_per_m = float(np.linalg.norm(np.subtract(*lines_of_sight(alignment))))
+    own, found = (robust_sigma(values, 0.0) for values in (across, along))
+    explained = float(np.hypot(own, LIDAR_SIGMA_M * px_per_m))
+    return found, explained * float(np.sqrt(chdtri(along.size - 1, CHANCE) / (along.size - 1)))
+
+
+def _constants(shifts: Floats) -> Floats:
+    """Parameters [12] of shifts [2, 2] of both images."""
+    parameters = np.zeros(12)
+    parameters[[2, 5, 8, 11]] = shifts.ravel()
+    return parameters
+
+
+def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
+    """The fault of height that tie points and prior would agree with, by generalised least squares.
+
+    ``alignment`` as it came, whose covariance is the prior.
+    """
+    offset, sigma = found.amount_along(_constants(-lines_of_sight(alignment)))
+    sigma = float(np.hypot(sigma, LIDAR_SIGMA_M))
+    return HeightOffset(offset, sigma, -float(ndtri(CHANCE / 2)) * sigma)
+
+
+def chance_of_contradiction(alignment: Alignment, found: Estimate) -> float:
+    """Probability that tie points differ so much from what is known of the alignment and of the
+    LiDAR in plan; by all parameters, or, if that is less, by the shift in plan alone.
+
+    ``alignment`` as it came. A LiDAR that is off in plan moves both images alike.
+    """
+    cols, rows = alignment.left_fit.size
+    height = alignment.reference_height
+    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+    step = LIDAR_PLAN_M / metres_per_degree(float(lat))
+    moved = []
+    for east, north in ((step[0], 0.0), (0.0, step[1])):
+        ends = [
+            np.stack([
+                np.array(sensor.project(lon + sign * east, lat + sign * north, height))
+                for sensor in (alignment.left, alignment.right)
+            ])
+            for sign in (-0.5, 0.5)
+        ]  # fmt: skip
+        moved.append(np.linalg.pinv(found.root) @ _constants(ends[1] - ends[0]))
+    plan = np.stack(moved, axis=1)
+    values, vectors = np.linalg.eigh(found.normal)
+    seen = values > 1e-9 * values.max()
+    alone = vectors[:, seen].T @ np.linalg.pinv(found.root) @ found.alone
+    known = vectors[:, seen].T @ (np.eye(len(values)) + plan @ plan.T) @ vectors[:, seen]
+    total = known + np.diag(1.0 / values[seen])
+    by_all = float(alone @ np.linalg.solve(total, alone))
+    # of the shift, in LIDAR_PLAN_M, by generalised least squares; its own variance, 1, is in total
+    along = vectors[:, seen].T @ plan
+    pull = along.T @ np.linalg.solve(total, alone)
+    by_shift = float(pull @ np.linalg.solve(along.T @ np.linalg.solve(total, along), pull))
+    return float(min(chdtrc(int(seen.sum()), by_all), chdtrc(2, by_shift)))
+
+
+def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:
+    """The same where nothing is known but that RPC errors have no preferred direction.
+
+    Of the four shifts of both images (two each), one combination looks like a fault of heights;
+    the other three, with what is not known of them, say how far these RPCs are off: Student's t.
+    """
+    look = lines_of_sight(alignment)
+    length = float(np.linalg.norm(look))
+    shifts, covariance = [], np.zeros((4, 12))
+    for k, (before, after) in enumerate(zip(alignment.fits, refined.fits)):
+        middle = (np.array(after.size) - 1) / 2
+        rpc = np.linalg.solve(after.affine[:, :2], middle - after.affine[:, 2])
+        shifts.append(middle - before.affine @ (*rpc, 1.0))
+        covariance[2 * k : 2 * k + 2, 6 * k : 6 * k + 6] = after.design(*middle)
+    covariance = covariance @ found.covariance @ covariance.T
+    along = -look.ravel() / length
+    moved = np.concatenate(shifts)
+    amount = float(along @ moved)
+    others = np.eye(4) - np.outer(along, along)
+    square = float(np.sum((others @ moved) ** 2) + np.trace(others @ covariance @ others))
+    sigma = float(np.hypot(np.sqrt(square / 3) / length, LIDAR_SIGMA_M))
+    return HeightOffset(amount / length, sigma, -float(stdtrit(3, CHANCE_OF_RPCS / 2)) * sigma)

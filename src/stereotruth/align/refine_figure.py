@@ -1,0 +1,164 @@
+"""The figure of a refinement, by its table of tie points."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rasterio.enums import Resampling
+
+from ..core.products.rasters import open_raster
+from ..pages.pictures import DIFFERENCES, save_figure, stretch
+from .aligned_pair import Alignment
+
+Floats = NDArray[np.float64]
+NAMES = ("disparity of LiDAR − that of the images", "y-parallax")
+PICTURE_PX = 1024  # of the left image
+
+
+class _Ties(NamedTuple):
+    """n tie points: ``site`` int[n]; place ``left`` [n, 2] in the left image and ``at`` [n, 2] in
+    the epipolar grid, px; residuals (disparity, y-parallax) ``before``, ``after`` and
+    ``by_affines`` alone [n, 2], px; which are ``used`` [n]."""
+
+    site: NDArray[np.int64]
+    left: Floats
+    at: Floats
+    before: Floats
+    after: Floats
+    by_affines: Floats
+    used: NDArray[np.bool_]
+
+    @classmethod
+    def read(cls, csv_file: str | Path) -> _Ties | None:
+        """Of a table of :func:`.refine_report.write_refinement`; None of an empty one."""
+        with Path(csv_file).open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+        if not rows:
+            return None
+
+        def pairs(*names: str) -> Floats:
+            return np.array([[float(row[name]) for name in names] for row in rows])
+
+        return cls(
+            np.array([int(row["site"]) for row in rows]),
+            pairs("left_col_px", "left_row_px"),
+            pairs("epipolar_x_px", "epipolar_y_px"),
+            pairs("disparity_before_px", "y_parallax_before_px"),
+            pairs("disparity_after_px", "y_parallax_after_px"),
+            pairs("disparity_by_affines_px", "y_parallax_by_affines_px"),
+            np.array([row["used"] == "yes" for row in rows]),
+        )
+
+
+def _reduced(left_image: str | Path) -> NDArray[np.uint8]:
+    """The first band of an image as a grey picture of PICTURE_PX at most on its longer side."""
+    with open_raster(left_image) as source:
+        step = max(1.0, max(source.shape) / PICTURE_PX)
+        shape = tuple(max(int(n / step), 1) for n in source.shape)
+        return stretch(source.read(1, out_shape=shape, resampling=Resampling.average))
+
+
+def _draw_over_image(axes: Sequence[Axes], ties: _Ties, left_image: str | Path) -> None:
+    """Tie points over the left image, coloured by the residual of the disparity."""
+    picture = _reduced(left_image)
+    with open_raster(left_image) as source:
+        rows, cols = source.shape
+    limit = max(float(np.percentile(np.abs(ties.before[:, 0]), 90)), 0.05)
+    for ax, word, values in zip(axes, ("before", "after"), (ties.before[:, 0], ties.after[:, 0])):
+        extent = (-0.5, cols - 0.5, rows - 0.5, -0.5)
+        ax.imshow(picture, cmap="gray", extent=extent)
+        shown = ax.scatter(
+            *ties.left.T, c=values, cmap=DIFFERENCES, vmin=-limit, vmax=limit, s=9, linewidths=0
+        )
+        ax.set_title(f"{word}: over the left image", loc="left", fontsize=10)
+        ax.set(xlabel="column in px of the left image", ylabel="row in px")
+        ax.figure.colorbar(shown, ax=ax, label="disparity of LiDAR − that of the images, px")
+
+
+def _draw_by_line(axes: Sequence[Axes], ties: _Ties) -> None:
+    """Residuals by line of the left image: of the affines alone, and with corrections by line."""
+    lines = ties.left[ties.used, 1]
+    for k, (ax, name) in enumerate(zip(axes, NAMES)):
+        for values, word, colour in (
+            (ties.by_affines, "affines alone", "0.6"),
+            (ties.after, "corrected by line", "C0"),
+        ):
+            ax.plot(lines, values[ties.used, k], ".", color=colour, markersize=3, label=word)
+        ax.axhline(0.0, color="black", linewidth=0.8)
+        ax.set(xlabel="line of the left image, px", ylabel=f"{name}, px")
+        ax.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+
+
+def draw_refinement(
+    alignment: Alignment, csv_file: str | Path, png_file: str | Path, left_image: str | Path
+) -> None:
+    """Draw the tie points of a refined alignment (PNG), by their table (CSV) and the left image.
+
+    Medians of the sites as vectors, tie points over the image, coloured by their residuals, and
+    histograms of these; where lines are corrected, residuals by line. Without tie points the figure
+    says why.
+    """
+    ties = _Ties.read(csv_file)
+    record = alignment.refinement
+    word = "applied" if record["applied"] else f"not applied: {record['reason']}"
+    by_line = bool(record.get("by_line", {}).get("used"))
+    figure = Figure(figsize=(11.5, 18.0 if by_line else 15.0), layout="constrained")
+    figure.suptitle(f"{alignment.scene or 'alignment'}: refinement {word}")
+    if ties is None:
+        save_figure(png_file, figure)
+        return
+    axes = figure.subplots(3 + by_line, 2, height_ratios=(3, 3, 2, 2)[: 3 + by_line])
+    if by_line:
+        _draw_by_line(axes[3], ties)
+    _draw_over_image(axes[1], ties, left_image)
+    used = ties.used
+    states = {"before": ties.before, "after": ties.after}
+    sites = np.unique(ties.site[used])
+    members = [used & (ties.site == site) for site in sites]
+    at = np.array([np.median(ties.at[m], axis=0) for m in members])
+    side = float(np.ptp(ties.at, axis=0).max())
+    vectors = {
+        name: np.array([np.median(values[m], axis=0) for m in members])
+        for name, values in states.items()
+    }
+    longest = max(float(np.hypot(*vectors["before"].T).max()), 1e-3)
+    key = float(f"{longest:.1g}")
+    for ax, (name, vector) in zip(axes[0], vectors.items()):
+        arrows = ax.quiver(
+            *at.T,
+            *vector.T,
+            angles="xy",
+            scale_units="xy",
+            scale=longest * 10 / side,
+            color="C0",
+            width=0.005,
+        )
+        ax.quiverkey(arrows, 0.85, 1.03, key, f"{key:g} px", labelpos="E", coordinates="axes")
+        ax.plot(*ties.at[~used].T, "x", color="C3", markersize=3, alpha=0.6)
+        ax.set_title(f"{name}: medians of {len(sites)} sites (× blunders)", loc="left", fontsize=10)
+        ax.set(xlabel="x in px of the epipolar grid", ylabel="y in px", aspect="equal")
+        ax.invert_yaxis()
+    for k, (ax, name, figures) in enumerate(zip(axes[2], NAMES, ("disparity", "y_parallax"))):
+        values = [state[used, k] for state in states.values()]
+        bins = np.linspace(*np.percentile(np.concatenate(values), (0.5, 99.5)), 61)
+        for (state, _), v, colour in zip(states.items(), values, ("0.7", "C0")):
+            f = record[state][figures]
+            ax.hist(
+                v,
+                bins,
+                color=colour,
+                alpha=0.7,
+                label=f"{state}: median {f['median']:.3f}, rms {f['rms']:.3f}, "
+                f"trend {f['trend_rms']:.3f} px",
+            )
+        ax.axvline(0.0, color="black", linewidth=0.8)
+        ax.set(xlabel=f"{name}, px", ylabel="tie points")
+        ax.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    save_figure(png_file, figure)

@@ -1,0 +1,1 @@
+"""What all rooms stand on: errors, configuration, sheets, files, grids, arrays, kernels."""

@@ -1,0 +1,207 @@
+"""The figures on top of a city's page, most important first; the page folds all but six.
+
+What images and control points say of a scene is as ``export.json`` has it and as the last lines of
+a run print it: over all matches and all labelled pixels of a scene. More of it is in the tables.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...pages.tables import Headline, joined, metres, minus, missed, number, spread
+from ...tiles.label_doubts import ABOUT, ALIGNMENT, LIDAR
+from ...tiles.sift_matches import SIFT_NOISE_PX
+from ...tiles.split_names import NONE, SPLITS
+
+Rows = Sequence[Mapping[str, str]]
+Records = Mapping[str, Mapping[str, Any]]
+
+
+def headlines(
+    rows: Rows,
+    alignments: Records,
+    refined: Records,
+    truth: Rows,
+    export: Mapping[str, Any],
+    height_m_per_px: float | None = None,
+) -> list[Headline]:
+    """The figures of a city; those whose input is missing are left out.
+
+    ``rows`` of the manifest, ``truth`` of truth.csv, ``export``: export.json; ``alignments``,
+    ``refined`` by scene; ``height_m_per_px``: metres of height for one px of disparity.
+    """
+    quality = export.get("quality", {})
+    labelled = [row for row in rows if row["complete"] == "yes"]
+    scenes = list(quality.get("scenes", {}).values())
+    by_scope = {row["scope"]: row for row in truth}
+    best = by_scope.get("tiles") or by_scope.get("scene") or {}
+    found = _uncertainty(export.get("label_uncertainty", {}), height_m_per_px)
+    error = number(best.get("mean_absolute_px", ""))
+    if error is not None:
+        note = joined("mean absolute", metres(error, height_m_per_px))
+        found.append(Headline("error against the truth", f"{error:.3f} px", note))
+    found.append(_pairs(rows, labelled))
+    shares = [s for row in labelled if (s := number(row["labelled_share"])) is not None]
+    if shares:
+        note = f"per tile {spread([100 * s for s in shares], '.0f')} %"
+        found.append(Headline("pixels labelled", f"{100 * np.mean(shares):.1f} %", note))
+    if "quality" in rows[0]:
+        found.append(_gates(labelled, quality))
+    found += _sift(scenes, height_m_per_px)
+    if alignments:
+        found.append(_gcps(alignments, refined))
+    if dense := [d for of in scenes if (d := of.get("lidar_points_per_m2")) is not None]:
+        text = f"{spread(dense, '.2g')} points/m²"
+        found.append(Headline("LiDAR density", text, "over the ground that it covers"))
+    found += _lidar([of for scene in scenes if (of := scene.get("lidar"))], labelled)
+    low = [v for row in labelled if (v := number(row["disparity_min_px"])) is not None]
+    high = [v for row in labelled if (v := number(row["disparity_max_px"])) is not None]
+    if low and high:
+        text = minus(f"{min(low):.0f} … {max(high):.0f} px")
+        note = metres(max(high) - min(low), height_m_per_px) or "of the tiles"
+        found.append(Headline("disparities", text, note))
+    return found
+
+
+def _uncertainty(by: Mapping[str, Any], height_m_per_px: float | None) -> list[Headline]:
+    """How well labels are known by what they state: of all, and by what they lie on."""
+    if "all" not in by:
+        return []
+    median, most = (by["all"][f"uncertainty_{name}_px"] for name in ("median", "p95"))
+    surfaces = ", ".join(
+        f"{name.replace('_', ' ')} {of['uncertainty_median_px']:.2g}"
+        for name, of in by.items()
+        if name != "all"
+    )
+    note = joined(
+        f"median; {most:.2g} px for 95 %", metres(median, height_m_per_px), f"medians: {surfaces}"
+    )
+    return [Headline("labels known to", f"{median:.2g} px", note)]
+
+
+def _lidar(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline]:
+    """What was read of the LiDAR, by the scene of which most was, and what is missing."""
+    if not scenes:
+        return []
+    most = max(scenes, key=lambda of: of["bytes"][0])
+    (read, every), files = most["bytes"], most["files"]
+    nodes = f", {most['nodes'][0]} of {most['nodes'][1]} nodes" if most["nodes"] else ""
+    holes = [of for of in scenes if of["holes_m2"] or of["not_read_m2"]]
+    note = f"points in {files[0]} of {files[1]} files{nodes}"
+    for of in holes[:1]:
+        if of["holes_m2"]:
+            lon, lat = of["hole"]
+            note += f"; no point on {of['holes_m2'] / 1e6:.3f} km² that both images show, "
+            note += f"around {lon:.5f}, {lat:.5f}"
+        if of["not_read_m2"]:
+            note += f"; {of['not_read_m2'] / 1e6:.3f} km² around the images were not read"
+    text = f"{read / 1e6:.1f} of {every / 1e6:.1f} MB"
+    read_of = Headline("LiDAR read", text, note, bool(holes))
+    return [read_of, *_dates(scenes, labelled), *_strips(scenes)]
+
+
+def _strips(scenes: Sequence[Mapping[str, Any]]) -> list[Headline]:
+    """How far strips are off those with most ground, of the scene where they are most in height."""
+    found = []
+    for strips in filter(None, (of.get("strips") for of in scenes)):
+        off = [row for row in strips["strips"] if row["beyond_noise"]]
+        if off:
+            up_m = max(abs(row["up_m"]) for row in off)
+            plan_m = max(math.hypot(row["east_m"], row["north_m"]) for row in off)
+            found.append((up_m, plan_m, len(off), len(strips["strips"]), strips["taken_out"]))
+    if not found:
+        return []
+    up_m, plan_m, off_count, count, taken_out = max(found)
+    note = f"{off_count} of {count} strips are off by up to so much in height, {plan_m:.2f} m in "
+    note += "plan; " + ("points are moved by that" if taken_out else "uncertainties have that")
+    return [Headline("strips of the LiDAR", f"{100 * up_m:.0f} cm", note, not taken_out)]
+
+
+def _dates(scenes: Sequence[Mapping[str, Any]], labelled: Rows) -> list[Headline]:
+    """When the LiDAR was measured, the days from there to the images of tiles, and what its heights
+    count from if that differs."""
+    days = [of["acquired"] for of in scenes if of["acquired"]]
+    surfaces = sorted({text for of in scenes for text in of["surfaces"]})
+    mixed = any(len(of["surfaces"]) > 1 for of in scenes)
+    if not days and not mixed:
+        return []
+    text = f"{min(d[0] for d in days)} to {max(d[1] for d in days)}" if days else "not known"
+    some = f"of {len(days)} of {len(scenes)} scenes" if 0 < len(days) < len(scenes) else ""
+    note = f"heights of different surfaces: {'; '.join(surfaces)}" if mixed else ""
+    note = joined(some, _days_to_images(labelled), note)
+    return [Headline("LiDAR measured", text, note, mixed)]
+
+
+def _days_to_images(labelled: Rows) -> str:
+    cells = [row.get(f"lidar_days_{view}", "") for row in labelled for view in ("left", "right")]
+    days = [int(cell) for cell in cells if cell]
+    if not days:
+        return ""
+    low, high = min(days), max(days)
+    if low < 0 < high:
+        return f"images from {-low} days earlier to {high} days later"
+    text = spread([abs(day) for day in days], ".0f")
+    return f"images {text} days {'later' if high > 0 else 'earlier'}"
+
+
+def _pairs(rows: Rows, labelled: Rows) -> Headline:
+    counts = [(s, sum(row["split"] == s for row in labelled)) for s in (*SPLITS, NONE)]
+    note = ", ".join(f"{n} {s if s != NONE else 'of no split'}" for s, n in counts if n)
+    if more := len(rows) - len(labelled):
+        note = joined(note, f"{more} more without full labels")
+    return Headline("labelled pairs", str(len(labelled)), note)
+
+
+def _is_told(doubt: Mapping[str, Any]) -> bool:
+    """Whether alignment or LiDAR doubt labels by more than these state."""
+    return doubt.get("of") in (ALIGNMENT, LIDAR) and not doubt["explained_by_alignment"]
+
+
+def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
+    bad = sum(bool(missed(row)) for row in labelled)
+    scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
+    note = f"and {', '.join(scenes)} as a whole" if scenes else ""
+    doubts = quality.get("doubts", {})
+    doubted = [s for s, of in doubts.items() if any(d.get("of") not in ABOUT for d in of)]
+    told = [s for s, of in doubts.items() if any(map(_is_told, of))]
+    if doubted:
+        note = joined(note, f"images and labels disagree in {', '.join(doubted)}")
+    if told:
+        note = joined(note, f"alignment or LiDAR of {', '.join(told)} in doubt")
+    text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
+    return Headline("limits of quality", text, note, bool(bad or scenes or doubted or told))
+
+
+def _sift(scenes: Sequence[Mapping[str, Any]], height_m_per_px: float | None) -> list[Headline]:
+    """What SIFT matches say of the labels, scene by scene, and SIFT's own noise."""
+    of = [scene for scene in scenes if scene.get("sift_mean_absolute_error_px") is not None]
+    if not of:
+        return []
+    errors = [float(scene["sift_mean_absolute_error_px"]) for scene in of]
+    height = metres(max(errors), height_m_per_px)
+    note = joined(
+        f"{len(of)} scenes" if of[1:] else "",
+        f"{sum(scene['sift_matches'] for scene in of)} matches, mean absolute",
+        f"about {SIFT_NOISE_PX:g} px of it SIFT's own",
+        height and f"≤ {height}" if of[1:] else height,
+    )
+    return [Headline("SIFT disparity − label", f"{spread(errors, '.2f')} px", note)]
+
+
+def _gcps(alignments: Records, refined: Records) -> Headline:
+    def rms(records: Records, which: str) -> str:
+        values = [
+            record.get(view, {}).get("rms", {}).get(which)
+            for record in records.values()
+            for view in ("left", "right")
+        ]
+        return spread(values, ".2f")
+
+    note = f"{rms(alignments, 'before')} px before"
+    if refined:
+        note += f", {rms(refined, 'after')} px after refinement"
+    return Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note)

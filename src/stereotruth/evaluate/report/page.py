@@ -1,0 +1,459 @@
+"""The page of a city: what was made, how good it is, and a look at every tile, in one file.
+
+The page needs no network and no other file. Pictures lie in it as WebP, within ``PICTURE_BYTES``
+in all: with many tiles, thumbnails get smaller and only some tiles have large pictures. A section
+whose input is missing is left out. Equal input gives equal bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.errors import InputError
+from ...core.job import progress
+from ...core.products.files import read_table
+from ...pages.page import way, write_page
+from ...pages.pictures import DISPARITIES, Scale, encode_file
+from ...pages.tables import Table, cells_of, columns_of, limit, minus, missed, table, texts, words
+from ...tiles.manifest import read_manifest
+from ...tiles.pixel_size import PixelSize
+from ...tiles.quick_looks import SPLIT_COLOURS, status_colours
+from ...tiles.split_names import NONE, SPLITS
+from . import tile_pictures
+from .headlines import headlines
+from .maps import calibration, histograms, tile_map
+
+Place = str | Path
+Row = Mapping[str, str]
+Record = Mapping[str, Any]
+
+PICTURE_BYTES = 24_000_000  # of all pictures as they stand in the page (base64)
+BASE64 = 3 / 4  # bytes of a picture per byte in the page
+SHARES = {"figures": 0.1, "thumbnails": 0.4, "sliders": 0.5}
+MOST_BYTES = {"figures": 600_000, "thumbnails": 24_000, "sliders": 200_000}  # of each picture
+COVERAGE_PX, FIGURE_PX, THUMBNAIL_PX, SLIDER_PX = 2200, 1400, 320, 900
+KINDS = ("left", "right", "disparity", "status")
+TEMPLATE = Path(__file__).with_name("page.html.jinja")
+FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest
+FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and these come first
+
+# Table 4 of the paper: (city, class), pairs, matches, mean of mean errors and of mean absolute
+# errors in px.
+PUBLISHED = (
+    ("Kunming", "building", 36, 3576, -0.69, 0.48),
+    ("Kunming", "vegetation", 216, 54838, -0.869, 0.66),
+    ("Qichun", "building", 128, 16643, -0.11, 0.51),
+    ("Qichun", "vegetation", 736, 99457, -0.5, 0.79),
+    ("Yingde", "building", 90, 13969, 0.09, 0.58),
+    ("Yingde", "vegetation", 438, 63226, 0.11, 0.73),
+    ("Shaoguan", "building", 77, 6744, -0.24, 0.42),
+    ("Wuhan", "building", 20, 1776, -0.37, 0.49),
+    ("Hengyang", "building", 22, 1139, -0.03, 0.32),
+    ("US3D", "building", 49, 3750, -0.20, 0.89),
+)
+
+
+@dataclass(frozen=True)
+class CityFiles:
+    """Files of a city; a section of the page is left out whose file is None or missing.
+
+    ``tiles``: the exported tiles; ``coverage``: the coverage map (PNG); ``looks``: georeferenced
+    pictures of the left images by scene; ``alignments``, ``refinements``: alignment.json by scene,
+    after the fit to the GCPs and after refinement, with their figures (PNG) ``residual_figures``
+    and ``refinement_figures``; ``truth``, ``truth_table``: truth.json and truth.csv; ``table4``,
+    ``sift``: table4.csv and sift.csv with their ``sift_figure`` (PNG).
+    """
+
+    tiles: Place
+    coverage: Place | None = None
+    looks: Mapping[str, Place] = field(default_factory=dict)
+    alignments: Mapping[str, Place] = field(default_factory=dict)
+    refinements: Mapping[str, Place] = field(default_factory=dict)
+    residual_figures: Mapping[str, Place] = field(default_factory=dict)
+    refinement_figures: Mapping[str, Place] = field(default_factory=dict)
+    truth: Place | None = None
+    truth_table: Place | None = None
+    table4: Place | None = None
+    sift: Place | None = None
+    sift_figure: Place | None = None
+
+    def links(self, page: Place) -> list[tuple[str, str, str]]:
+        """Name, way from the page and meaning of what a reader may open, as far as it exists."""
+        folder = Path(self.tiles)
+        every = (
+            (folder, "tiles", "left, right, disp, status, orientation"),
+            (folder / "manifest.csv", "manifest.csv", "one row per tile"),
+            (folder / "footprints.geojson", "footprints.geojson", "with a style for QGIS"),
+            (folder / "export.json", "export.json", "figures, limits, parameters"),
+            (self.truth_table, "truth.csv", "labels against the exact truth"),
+            (self.table4, "table4.csv", "SIFT matches, as table 4 of the paper"),
+            (self.sift, "sift.csv", "the same by scene and tile"),
+        )
+        return [
+            (name, str(way(page, file)), text)
+            for file, name, text in every
+            if file is not None and Path(file).exists()
+        ]
+
+
+def write_report(
+    city: str,
+    files: CityFiles,
+    out: Place,
+    *,
+    index: Place | None = None,
+    sliders: int = 0,
+    workers: int = 1,
+    code: str = "",
+) -> None:
+    """Write the page of a city from its ``files``.
+
+    ``index``: the page of all pages. ``sliders``: most tiles with large pictures.
+
+    Raises InputError if there is no manifest.
+    """
+    folder = Path(files.tiles)
+    rows = read_manifest(folder)
+    labelled = [row for row in rows if row["complete"] == "yes"]
+    export, truth = _record(folder / "export.json"), _record(files.truth)
+    alignments, refined = _records(files.alignments), _records(files.refinements)
+    sizes = _pixel_sizes(folder, labelled)
+    height = max((size.height_m for size in sizes.values()), default=None)
+    truth_rows = _rows(files.truth_table)
+    figure_count = 2 + len(files.looks) + 2 * len(alignments)
+    allowed = _allowance("figures", figure_count)
+
+    def embedded(file: Place | None, side: int = FIGURE_PX) -> str | None:
+        is_there = file is not None and Path(file).is_file()
+        return encode_file(Path(file), allowed, side) if is_there else None
+
+    made_of = {
+        "tiles": export,
+        **{f"alignment of {scene}": record for scene, record in alignments.items()},
+        **{f"refinement of {scene}": record for scene, record in refined.items()},
+        "comparison with the truth": truth,
+        "this page": {"provenance": {"code": code, "sliders": sliders}},
+    }
+    looks = [Path(file) for file in files.looks.values() if Path(file).is_file()]
+    values = {
+        "city": city,
+        "index": way(out, index),
+        "headlines": headlines(rows, alignments, refined, truth_rows, export, height),
+        "sizes": sizes,
+        "height_m_per_px": height,
+        "links": files.links(out),
+        "provenance": provenance(made_of),
+        "export": export,
+        "coverage": embedded(files.coverage, COVERAGE_PX),
+        "map": tile_map(folder, rows, looks, allowed),
+        "residuals": [
+            {
+                "scene": scene,
+                **_residuals(record, refined.get(scene, {})),
+                "figures": [
+                    (title, uri)
+                    for title, of in (
+                        ("residuals of the control points", files.residual_figures),
+                        ("tie points before and after refinement", files.refinement_figures),
+                    )
+                    if (uri := embedded(of.get(scene)))
+                ],
+            }
+            for scene, record in alignments.items()
+        ],
+        "table4": table4_beside_the_paper(_rows(files.table4)),
+        "sift": table(_rows(files.sift)),
+        "sift_figure": embedded(files.sift_figure),
+        "truth": _exact_truth(truth_rows, truth),
+        "quality": _quality_gates(export.get("quality", {})),
+        **_of_tiles(city, folder, rows, sizes, sliders, workers),
+    }
+    write_page(out, TEMPLATE, values)
+
+
+def _of_tiles(
+    city: str,
+    folder: Path,
+    rows: Sequence[Row],
+    sizes: Mapping[str, PixelSize],
+    sliders: int,
+    workers: int,
+) -> dict[str, Any]:
+    """The page's values about the tiles, with their pictures; large ones of ``sliders`` tiles."""
+    labelled = [row["tile"] for row in rows if row["complete"] == "yes"]
+    large = _chosen(labelled, sliders)
+    small = len(KINDS) * len(labelled) + 2 * (len(rows) - len(labelled))
+    thumbnail = THUMBNAIL_PX, _allowance("thumbnails", small)
+    big = SLIDER_PX, _allowance("sliders", len(tile_pictures.LARGE) * len(large))
+    with ThreadPoolExecutor(workers) as pool:
+        counted = list(pool.map(lambda row: tile_pictures.disparity_counts(folder, row), rows))
+        limits = tile_pictures.disparity_limits(counted)
+
+        def draw(row: Row) -> tile_pictures.TilePictures:
+            size = sizes.get(row["scene"])
+            return tile_pictures.tile_pictures(
+                folder,
+                row,
+                thumbnail=thumbnail,
+                large=big if row["tile"] in large else None,
+                limits_px=limits,
+                base_to_height=size.base_to_height if size else 1.0,
+            )
+
+        drawn = list(progress(pool.map(draw, rows), len(rows), f"{city}: tiles drawn"))
+    made = {row["tile"]: of for row, of in zip(rows, drawn)}
+    spans = {name: np.ptp(of.disparity_px) for name, of in made.items() if of.layers}
+    statuses: Counter[str] = Counter()
+    for row in rows:
+        if row["complete"] == "yes":
+            statuses.update(status_counts(row))
+    total = max(statuses.total(), 1)
+
+    def by(column: str, values: Iterable[str]) -> dict[str, Counter[int]]:
+        return {
+            value: sum((c for row, c in zip(rows, counted) if row[column] == value), Counter())
+            for value in values
+        }
+
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    return {
+        "rows": rows,
+        "scenes": scenes,
+        "made": made,
+        "first": max(spans, key=spans.__getitem__, default=None),
+        "disparities": limits and Scale.of(DISPARITIES, *(minus(f"{v:.0f} px") for v in limits)),
+        "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
+        "statuses": {name: count / total for name, count in statuses.items() if count},
+        "status_colours": status_colours(list(statuses)),
+        "shares": {row["tile"]: _shares(status_counts(row)) for row in rows},
+        "split_colours": SPLIT_COLOURS,
+        "no_match": f"rgb{tile_pictures.NO_MATCH}",
+        "histograms": [
+            chart
+            for chart in (
+                histograms("disparities by split", by("split", (*SPLITS, NONE))),
+                histograms("disparities by scene", by("scene", scenes)) if scenes[1:] else None,
+            )
+            if chart
+        ],
+        "manifest": table(
+            rows,
+            manifest_columns(rows),
+            {"tile": {row["tile"]: f"#tile-{row['tile']}" for row in rows}},
+        ),
+        "large_count": len(large),
+        "few_large": len(large) < len(labelled),
+    }
+
+
+def _chosen(names: Sequence[str], most: int) -> set[str]:
+    """At most so many of the names, evenly chosen, the first and the last included."""
+    if len(names) <= most:
+        return set(names)
+    picked = np.linspace(0, len(names) - 1, most).round().astype(int) if most else []
+    return {names[k] for k in picked}
+
+
+def _allowance(share: str, count: int) -> int:
+    """Bytes of each of ``count`` pictures of a kind."""
+    return min(MOST_BYTES[share], int(PICTURE_BYTES * BASE64 * SHARES[share] / max(count, 1)))
+
+
+def _rows(path: Place | None) -> list[dict[str, str]]:
+    """Rows of a CSV file; none if there is no such file."""
+    return list(read_table(path)) if path is not None and Path(path).is_file() else []
+
+
+def _records(files: Mapping[str, Place]) -> dict[str, dict[str, Any]]:
+    """Records by scene, those that are there."""
+    found = {scene: _record(file) for scene, file in files.items()}
+    return {scene: record for scene, record in found.items() if record}
+
+
+def _record(path: Place | None) -> dict[str, Any]:
+    """A JSON file's object; empty if there is no such file. Raises InputError if it is damaged."""
+    if path is None or not Path(path).is_file():
+        return {}
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError:
+        raise InputError(
+            "damaged: it is no JSON", file=path, remedy="delete it and run the workflow again"
+        ) from None
+
+
+def _pixel_sizes(folder: Path, labelled: Sequence[Row]) -> dict[str, PixelSize]:
+    """What a pixel is in metres, by scene, of some of the tiles."""
+    found = {}
+    for scene in dict.fromkeys(row["scene"] for row in labelled):
+        here = [row for row in labelled if row["scene"] == scene and row.get("orientation")]
+        if size := PixelSize.mean([folder / row["orientation"] for row in here[:20:4]]):
+            found[scene] = size
+    return found
+
+
+def status_counts(row: Row) -> dict[str, int]:
+    """Pixels of a tile by status."""
+    return {
+        name.removeprefix("count_"): int(value)
+        for name, value in row.items()
+        if name.startswith("count_") and value
+    }
+
+
+def _shares(counts: Mapping[str, int]) -> dict[str, float]:
+    total = max(sum(counts.values()), 1)
+    return {name: count / total for name, count in counts.items() if count}
+
+
+def _residuals(record: Record, later: Record) -> dict[str, Any]:
+    """Of a scene: model, warnings, a table of the points, and what a refinement did."""
+    points = []
+    for view in ("left", "right"):
+        for point in record.get(view, {}).get("gcps", []):
+            row = {"image": view, "GCP": point["id"]}
+            for which in ("before", "after", "leave_one_out"):
+                pair = point.get(which, [None])
+                row[f"{which}_px"] = "" if None in pair else f"{np.hypot(*pair):.3f}"
+            used = "yes" if point.get("used", True) else "no"
+            points.append(row | {"used": used, "reason": point.get("reason", "")})
+    found = later.get("refinement", {})
+    ties = [
+        {
+            "tie points": f"{words(name)} {when}",
+            **{f"{k}_px": f"{v:.4f}" for k, v in values.items() if isinstance(v, int | float)},
+        }
+        for name in ("disparity", "y_parallax")
+        for when in ("before", "after")
+        if (values := found.get(when, {}).get(name))
+    ]
+    return {
+        "model": record.get("model", ""),
+        "warnings": list(dict.fromkeys([*record.get("warnings", []), *later.get("warnings", [])])),
+        "points": table(points),
+        "refinement": found,
+        "ties": table(ties),
+    }
+
+
+def table4_beside_the_paper(rows: Sequence[Row]) -> Table | None:
+    """This run's rows of the paper's Table 4 above the published ones, in its columns first."""
+    if not rows:
+        return None
+    names = list(rows[0])
+    ours = tuple(cells_of(names, row) for row in rows)
+    published = tuple(
+        cells_of(names, dict(zip(names, [f"{name} ({kind})", *map(str, numbers)])))
+        for name, kind, *numbers in PUBLISHED
+    )
+    groups = (("this run", ours), ("published: Li et al. 2023, table 4", published))
+    return Table(columns_of(names, rows), groups)
+
+
+def _exact_truth(rows: Sequence[Row], record: Record) -> dict[str, Any] | None:
+    """Figures of scenes and surfaces, of each tile, by status, and of the uncertainty."""
+    if not rows:
+        return None
+    of_tiles = record.get("exported_tiles", {})
+    groups = of_tiles.get("status", {})
+    names = list(dict.fromkeys(name for counts in groups.values() for name in counts))
+    by_status = [
+        {"pixels that are": words(group), "count": str(total)}
+        | {f"share_{name}": f"{counts.get(name, 0) / total:.6f}" for name in names}
+        for group, counts in groups.items()
+        if (total := sum(counts.values()))
+    ]
+    stated = of_tiles.get("calibration", {})
+    caption = "Errors below once and twice their uncertainty; dashed: where it is right."
+    if stated.get("share_below_1") is not None:
+        caption += (
+            f" {100 * stated['share_below_1']:.1f} % of all are below their uncertainty (68.3 % is "
+            f"right), {100 * stated['share_below_2']:.1f} % below twice theirs (95.4 %)."
+        )
+    meaning = record.get("meaning", {})
+    return {
+        "whole": table([r for r in rows if not r["scope"].startswith("tile ")]),
+        "tiles": table([r for r in rows if r["scope"].startswith("tile ")]),
+        "status": table(by_status),
+        "calibration": calibration(stated.get("deciles", []), caption),
+        "meaning": {words(k): v for k, v in meaning.items() if isinstance(v, str)},
+    }
+
+
+def _quality_gates(record: Record) -> dict[str, Any] | None:
+    """The limits of the gates, the figures of each scene with the gates that it misses, doubts.
+
+    And what the images say of the labels of each scene, by surface.
+    """
+    scenes = record.get("scenes", {})
+    if not scenes:
+        return None
+    rows = [{"scene": scene, **texts(figures)} for scene, figures in scenes.items()]
+    shown = [
+        name
+        for name in dict.fromkeys(["scene", "quality", *rows[0]])
+        if name != "lidar" and any(row.get(name) for row in rows)  # what was read has its own card
+    ]
+    return {
+        "table": table(rows, shown),
+        "limits": [limit(name, v) for name, v in record.get("limits", {}).items() if v is not None],
+        "doubts": [
+            f"{scene}: {doubt['text']}"
+            for scene, found in record.get("doubts", {}).items()
+            for doubt in found
+        ],
+        "strips": table(
+            [
+                {"scene": scene, **texts(row)}
+                for scene, figures in scenes.items()
+                for row in ((figures.get("lidar") or {}).get("strips") or {}).get("strips", ())
+            ]
+        ),
+        "surfaces": table(
+            [
+                {"scene": scene, "of": words(of), **texts(figures)}
+                for scene, by in record.get("surfaces", {}).items()
+                for of, figures in by.items()
+            ]
+        ),
+    }
+
+
+def provenance(records: Mapping[str, Record]) -> list[dict[str, Any]]:
+    """Per product: software and code, parameters, inputs, as (name, value)."""
+
+    def flat(values: Record, prefix: str = "") -> list[tuple[str, str]]:
+        pairs = []
+        for key, value in values.items():
+            if isinstance(value, Mapping):
+                pairs += flat(value, f"{prefix}{key}.")
+            else:
+                text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+                pairs.append((f"{prefix}{key}", text))
+        return pairs
+
+    return [
+        {"product": product, "values": flat(record["provenance"])}
+        for product, record in records.items()
+        if record.get("provenance")
+    ]
+
+
+def manifest_columns(rows: Sequence[Row]) -> list[str]:
+    """Columns that differ between tiles, without files and checksums; ``FIRST`` first."""
+    names = [
+        name
+        for name in rows[0]
+        if name not in (*FILES, "number")
+        and not name.endswith("_sha256")
+        and (name in ("tile", "scene", "split", "quality") or len({r[name] for r in rows}) > 1)
+    ]
+    return sorted(names, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))

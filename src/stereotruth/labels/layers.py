@@ -1,0 +1,200 @@
+"""The arrays of a disparity store: what their attributes say, and their values."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.config.labels import LabelSettings
+from ..core.products.grids import Layer
+from ..core.status import Reason, Status, is_labelled, statuses_of
+from .pair_window import PairWindow, WindowLabels
+from .right_view import Pair
+
+GREATEST_COUNT = 65535  # of points of a pixel that is stored
+
+
+def layers_of(labels: WindowLabels, pair: Pair, window: PairWindow) -> dict[str, NDArray]:
+    """The layers of a window, without its margin, from its ``labels`` there.
+
+    The variance of the alignment joins that of the labels (eq. 13 of docs/explanation/surface.md).
+    """
+    y, x = (
+        np.arange(grid.start + window.margin, grid.stop - window.margin, dtype=np.float64)
+        for grid in (window.rows, window.cols)
+    )
+    variance = labels.labels.variance + pair.alignment_variance(x, y, labels.labels.slope)
+    values = {
+        "disparity": labels.labels.disparity,
+        "height": labels.height,
+        "correlation": labels.correlation,
+        "uncertainty": np.sqrt(variance),
+    }
+    known = is_labelled(labels.status)
+    layers = {name: np.where(known, v, np.nan).astype(np.float32) for name, v in values.items()}
+    kept = known | (labels.status == Status.BELOW_MINIMUM_COUNT)
+    count = np.where(kept, np.minimum(labels.point_count, GREATEST_COUNT), 0)
+    layers["point_count"] = count.astype(np.uint16)
+    layers["surface_class"] = np.where(known, labels.surface_class, 0).astype(np.uint8)
+    layers["lidar_date"] = np.where(known, labels.day, 0).astype(np.uint16)
+    layers["status"] = labels.status
+    layers["change"] = labels.change
+    return layers
+
+
+def layers(settings: LabelSettings, view: str, masked: bool = False) -> dict[str, Layer]:
+    """The arrays of a disparity store of the ``view``, left or right.
+
+    ``masked``: whether a mask hides something of an image.
+    """
+    on_surface = settings.recipe == "surface"
+    used = "points whose image windows correlate"
+    if on_surface:
+        used = "points on the surface that the pixel's centre sees"
+    height = {
+        "units": "m",
+        "long_name": "greatest height above the WGS 84 ellipsoid of the points used",
+        "nodata": "NaN",
+    }
+    count = {
+        "units": "1",
+        "long_name": f"number of points used: {used}",
+        "comment": f"counts above {GREATEST_COUNT} are stored as {GREATEST_COUNT}",
+    }
+    surface_class = {
+        "units": "1",
+        "long_name": "LAS class (ASPRS) of the highest point used",
+        "comment": "0: never classified, or no label",
+    }
+    return {
+        "disparity": Layer("float32", np.nan, _disparity(on_surface, view)),
+        "status": Layer("uint8", 0, _status(settings, view, masked)),
+        "height": Layer("float32", np.nan, height),
+        "point_count": Layer("uint16", 0, count),
+        "correlation": Layer("float32", np.nan, _correlation(settings, view)),
+        "uncertainty": Layer("float32", np.nan, _uncertainty(settings)),
+        "surface_class": Layer("uint8", 0, surface_class),
+        "lidar_date": Layer("uint16", 0, _lidar_date(on_surface)),
+        "change": Layer("uint8", 0, _change()),
+    }
+
+
+def _other(view: str) -> str:
+    return {"left": "right", "right": "left"}[view]
+
+
+def _disparity(on_surface: bool, view: str) -> dict[str, str]:
+    """Attributes of the layer disparity."""
+    match = {"left": "x - disparity", "right": "x + disparity"}[view]
+    attributes = {
+        "units": "px",
+        "long_name": f"ground-truth disparity x_left - x_right of the {view} view",
+        "nodata": "NaN",
+        "match": f"what the {view} image shows at (x, y), the {_other(view)} one shows at "
+        f"({match}, y)",
+        "representative": "disparity of the point at mean longitude and latitude, greatest height",
+    }
+    if on_surface:
+        attributes["representative"] = (
+            "disparity at the pixel's centre, by a plane through the mean points of the pixel and "
+            "of its neighbours on the same surface"
+        )
+        attributes["between"] = (
+            "where the status is labelled_between, or a point is less sure than those around it: "
+            "linear in the facet of points that the pixel's centre sees; where it is "
+            "labelled_crown: linear in the triangle of the tops of a rough surface"
+        )
+    return attributes
+
+
+def _status(settings: LabelSettings, view: str, masked: bool) -> dict[str, object]:
+    """Attributes of the layer status."""
+    other = _other(view)
+    statuses = statuses_of(settings.recipe, masked)
+    attributes = {
+        "units": "1",
+        "long_name": "why a pixel has a label or none",
+        "flag_values": [int(status) for status in statuses],
+        "flag_meanings": " ".join(status.label for status in statuses),
+        f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre sees",
+        "changed": "LiDAR and images show different surfaces there, or water",
+        "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other surfaces",
+        "precedence": f"frame, {view} view, correlation of points; {other} view, edge, change, "
+        "number of points of pixels",
+    }
+    if settings.recipe == "surface":
+        attributes |= {
+            "labelled_crown": "a rough surface that both views must show; its uncertainty follows "
+            "from the roughness of its points",
+            "edge_in_pixel": "no facet of points, or a height step between points may be nearer to "
+            "one of the cameras",
+        }
+    if masked:
+        attributes["masked"] = (
+            f"a mask hides the pixel, or what the {other} image shows of it; or a mask reaches "
+            "into the windows that are compared around it"
+        )
+    return attributes
+
+
+def _change() -> dict[str, object]:
+    """Attributes of the layer change."""
+    return {
+        "units": "1",
+        "long_name": "what has changed between LiDAR and images, of pixels of the status changed",
+        "flag_values": [int(reason) for reason in Reason],
+        "flag_meanings": " ".join(reason.name.lower() for reason in Reason),
+        "grown_or_felled": "trees and other vegetation",
+        "moved": "vehicles, and what else is as small and low",
+        "ground": "the ground itself, as crops, earthworks",
+        "unknown": "the images contradict the LiDAR, and nothing tells what has changed",
+    }
+
+
+def _lidar_date(on_surface: bool) -> dict[str, object]:
+    """Attributes of the layer lidar_date, which xarray reads as dates."""
+    point = "nearest vertex of the surface, by the GPS time of its highest point"
+    if not on_surface:
+        point = "highest point used, by its GPS time"
+    return {
+        "units": "days since 1970-01-01",
+        "calendar": "proleptic_gregorian",
+        "long_name": f"day on which the LiDAR measured what the label shows: that of the {point}, "
+        "else the middle of the days of its file by the list of tiles",
+        "nodata": 0,
+        "_FillValue": 0,  # not known, or no label
+    }
+
+
+def _correlation(settings: LabelSettings, view: str) -> dict[str, str]:
+    """Attributes of the layer correlation."""
+    compared = "mean correlation coefficient of the image windows at the points used"
+    if settings.recipe == "surface":
+        compared = (
+            f"correlation coefficient of {view} and warped {_other(view)} image over the pixels of "
+            f"the same surface in {settings.window} x {settings.window} px"
+        )
+    return {"units": "1", "long_name": compared, "nodata": "NaN"}
+
+
+def _uncertainty(settings: LabelSettings) -> dict[str, str]:
+    """Attributes of the layer uncertainty."""
+    attributes = {
+        "units": "px",
+        "long_name": "standard uncertainty of the disparity",
+        "nodata": "NaN",
+        "formula": "sqrt(v / n + p + var(ed - gx ex - gy ey)): v variance of the points' "
+        "disparities about their surface, pooled over 3 x 3 pixels; n point_count; p variance of "
+        "the plane to the centre; (gx, gy) slope of the disparity; ed, (ex, ey) errors of a ground "
+        "point's disparity and place by the alignment, whose covariance is that of alignment.json",
+    }
+    if settings.recipe == "surface":
+        attributes["labelled_crown"] = (
+            "v / n + p is what the roughness of the tops of the surface leaves between them"
+        )
+    if settings.recipe == "surface" and settings.diachronic:
+        attributes["diachronic"] = (
+            "p has the probability, px², that the surface has changed though images of two lights "
+            "do not contradict it"
+        )
+    return attributes

@@ -1,0 +1,198 @@
+"""Where the points of a window are.
+
+A window of the left epipolar grid shows the points of a box on the ground that depends on their
+heights; what can hide these lies around it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.numerics.hull import corners_of_hull
+from ..lidar.lattice import CELL_BITS, LATTICE_DEG
+from ..lidar.point_store import PointStore
+from .rays import Rays
+from .view_geometry import ViewGeometry
+
+Box = tuple[float, float, float, float]
+Floats = NDArray[np.float64]
+
+
+READ_POINTS = 1 << 20  # about as many are read at once
+
+
+class Footprint(NamedTuple):
+    """Where the points of a window are: box of those that it can show, with their heights (m);
+    box ``around`` of what can hide these."""
+
+    box: Box
+    low: float
+    high: float
+    around: Box
+
+
+@dataclass(frozen=True, eq=False)
+class PointWindows:
+    """The points of ``stores`` by windows (rows, cols) of the left epipolar grid.
+
+    ``margin``: pixels around a window whose points have a say in it. ``reach``: degrees (lon, lat)
+    around a place of the surface between triangles there and their vertices.
+    """
+
+    model: ViewGeometry
+    rays: Rays
+    stores: tuple[PointStore, ...]
+    margin: int
+    reach: tuple[float, float]
+
+    def ground_box(self, rows: slice, cols: slice, low: float, high: float) -> Box | None:
+        """lon, lat box (degrees) of what a window of the left grid can show at these heights."""
+        ground = self.ground_outline(rows, cols, low, high)
+        if ground.size == 0:
+            return None
+        (west, south), (east, north) = ground.min(axis=1), ground.max(axis=1)
+        # Two pixels more, for the curvature of the edges.
+        spare = 4.0 * np.array(self.rays.cell) * LATTICE_DEG
+        return west - spare[0], south - spare[1], east + spare[0], north + spare[1]
+
+    def ground_outline(self, rows: slice, cols: slice, low: float, high: float) -> Floats:
+        """lon, lat [2, n] (degrees) along the edges of a window and its margin at two heights."""
+        margin = self.margin
+        x = np.linspace(cols.start - margin - 1.0, cols.stop + margin, 5)
+        y = np.linspace(rows.start - margin - 1.0, rows.stop + margin, 5)
+        edge_x = np.concatenate([x, x, np.full(5, x[0]), np.full(5, x[-1])])
+        edge_y = np.concatenate([np.full(5, y[0]), np.full(5, y[-1]), y, y])
+        ground = np.hstack(
+            [np.stack(self.model.epipolar_to_ground(edge_x, edge_y, h)) for h in (low, high)]
+        )
+        return ground[:, np.isfinite(ground).all(axis=0)]
+
+    def heights(self, box: Box) -> tuple[float, float] | None:
+        """Lowest and highest point (m) of the stores' cells that a box touches."""
+        each = [r for r in (store.height_range(*box) for store in self.stores) if r is not None]
+        return (min(r[0] for r in each), max(r[1] for r in each)) if each else None
+
+    def footprint(self, rows: slice, cols: slice) -> Footprint | None:
+        """Of a window; None if there are no points."""
+        low = min(store.bounds[4] for store in self.stores)
+        top = high = max(store.bounds[5] for store in self.stores)
+        box = None
+        for _ in range(3):  # heights narrow the box, the box narrows the heights
+            box = self.ground_box(rows, cols, low, high)
+            heights = None if box is None else self.heights(box)
+            if heights is None:
+                return None
+            low, high = heights
+        moves = self.rays.moves(cols, rows)
+        spare = np.array(self.reach) + self.spare
+        around = box
+        for _ in range(3):
+            rise = top - low
+            around = (
+                box[0] + moves[0, 0] * rise - spare[0],
+                box[1] + moves[1, 0] * rise - spare[1],
+                box[2] + moves[0, 1] * rise + spare[0],
+                box[3] + moves[1, 1] * rise + spare[1],
+            )
+            top = self.heights(around)[1]
+        return Footprint(box, low, high, around)
+
+    @property
+    def spare(self) -> Floats:
+        """Degrees (lon, lat) of two cells around, for what is not linear in between."""
+        return 2.0 * np.array(self.rays.cell) * LATTICE_DEG
+
+    def strips(
+        self, rows: slice, cols: slice, footprint: Footprint, *, by_row: bool = False
+    ) -> list[Box]:
+        """Boxes, one for some rows of cells of the stores each, of the points a window needs.
+
+        They cover the hull of what it can show. A box around the hull of a turned image would hold
+        up to twice as many points. ``by_row``: one box for each row.
+        """
+        ground = self.ground_outline(rows, cols, footprint.low, footprint.high)
+        box = footprint.box
+        hull = ground[:, corners_of_hull(*ground)]
+        after = np.roll(hull, -1, axis=1)
+        rise = after[1] - hull[1]
+        slope = (after[0] - hull[0]) / np.where(rise == 0.0, np.inf, rise)
+        spare = self.spare
+        side = LATTICE_DEG * (1 << CELL_BITS)
+        first, last = (int(np.floor(edge / side)) for edge in (box[1], box[3]))
+        step = max(round(READ_POINTS / max(self.expected([box]), 1.0) * (last + 1 - first)), 1)
+        if by_row:
+            step = 1
+        strips = []
+        for row in range(first, last + 1, step):
+            # Half a step below the border, so that no point lies on it.
+            south, north = (
+                np.clip(edge * side - 0.5 * LATTICE_DEG, box[1], box[3])
+                for edge in (row, row + step)
+            )
+            # Where the sides of the hull, cut off at the strip's borders, begin and end.
+            ends = np.clip([hull[1], after[1]], south - spare[1], north + spare[1])
+            lon = hull[0] + slope * (ends - hull[1])
+            touched = np.ptp(ends, axis=0) > 0.0
+            if touched.any():
+                west, east = lon[:, touched].min(), lon[:, touched].max()
+                strips.append((west - spare[0], south, east + spare[0], north))
+        return strips
+
+    def beyond_stores(self, rows: slice, cols: slice) -> float:
+        """Ground (m²) whose points a window needs, and which the stores' footprints leave out.
+
+        In whole cells of the stores, of the store that leaves out most of it.
+        """
+        footprint = self.footprint(rows, cols)
+        if footprint is None:
+            return 0.0
+        boxes = np.array(self.strips(rows, cols, footprint, by_row=True)).reshape(-1, 4)
+        held = [store.footprint for store in self.stores]
+        return max((f.beyond_m2(boxes) for f in held if f is not None), default=0.0)
+
+    def expected(self, boxes: Sequence[Box]) -> float:
+        """About how many points lie in boxes, if the stores are evenly filled."""
+        total = 0.0
+        for store in self.stores:
+            west, south, east, north = store.bounds[:4]
+            for box in boxes:
+                share = 1.0
+                for a, b, low, high in (
+                    (box[0], box[2], west, east),
+                    (box[1], box[3], south, north),
+                ):
+                    share *= max(min(b, high) - max(a, low), 0.0) / max(high - low, 1e-12)
+                total += store.count * share
+        return total
+
+    def touched(self, rows: slice, cols: slice) -> list[PointStore]:
+        """The stores that have points of a window, or in the same cells."""
+        footprint = self.footprint(rows, cols)
+        strips = [] if footprint is None else self.strips(rows, cols, footprint)
+        return [
+            store
+            for store in self.stores
+            if any(store.height_range(*strip) is not None for strip in strips)
+        ]
+
+    def parts(self, rows: slice, cols: slice, max_points: int) -> list[tuple[slice, slice]]:
+        """The window cut along its longer side until no part expects more points."""
+        footprint = self.footprint(rows, cols)
+        if footprint is None:
+            return []
+        tall, broad = rows.stop - rows.start, cols.stop - cols.start
+        many = self.expected(self.strips(rows, cols, footprint)) > max_points
+        if not many or max(tall, broad) <= 128:
+            return [(rows, cols)]
+        if tall > broad:
+            middle = rows.start + tall // 2
+            halves = [(slice(rows.start, middle), cols), (slice(middle, rows.stop), cols)]
+        else:
+            middle = cols.start + broad // 2
+            halves = [(rows, slice(cols.start, middle)), (rows, slice(middle, cols.stop))]
+        return [window for half in halves for window in self.parts(*half, max_points)]

@@ -1,0 +1,335 @@
+"""Points to disparity: the stage `project` (paper, section III-C).
+
+Every point is projected into both rectified images, and a pixel of the left epipolar grid has the
+label d = x_left - x_right (px) of what it shows, by one of two recipes (``project.recipe``): see
+:mod:`.recipe` and :mod:`.paper_recipe`. A point belongs to the pixel (floor(x_left + 0.5),
+floor(y_left + 0.5)). The right image's labels are those of the mirrored pair, see
+:mod:`.right_view`.
+
+The grid is worked on in blocks of one shard, each independent of the others; a block is cut into
+windows of a bounded number of points. The result has the same bytes for any number of workers, size
+of windows, and order of blocks, stores and points.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import dask.threaded
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import InputError
+from ..core.job import block_progress
+from ..core.products.grids import Strip, blocks, require_complete
+from ..core.products.provenance import checksums, describe, digest
+from ..core.products.resumable_grids import BlockStore, resumable_grid
+from ..core.status import Status, carries_label, is_labelled
+from ..epipolar.model import EpipolarModel
+from ..lidar.overlap_check import apart, refuse_apart
+from .change_evidence import Evidence
+from .image_patches import MaskedImage
+from .layers import layers
+from .lidar_read import lidar_read
+from .recipe import label_window
+from .scene_inputs import SceneInputs
+
+log = logging.getLogger("stereotruth")
+
+
+CHUNK = 256
+SHARD = 1024
+MAX_POINTS = 6_000_000  # expected in a window; some 60 bytes each at the peak
+
+
+LEAST_LABELLED = 0.4  # of the pixels with points: below, a warning says what to check
+# Of a block, see :func:`.recipe.label_window`.
+COUNTED = "in_grid", "in_frame", "used", "asked", *Evidence._fields
+# Share of the pixels that are asked which lies beyond what was learned by a figure of the evidence:
+# no simulated city and no real scene of those that trees are fitted to has more than 11 %.
+FAR_BEYOND = 0.15
+ENOUGH = 80.0  # % of the pixels with a point: below, a warning says how to have more labels
+
+
+def _log_density(inputs: SceneInputs) -> None:
+    """Log how dense the points are, and what that leaves without a label."""
+    pixel = inputs.rays.pixel_m
+    per_px = inputs.points_per_m2 * pixel**2
+    share = 100.0 * (1.0 - np.exp(-per_px))  # of points strewn at random
+    density = f"about {inputs.points_per_m2:.2g} LiDAR points per m², pixels of {pixel:.2g} m"
+    if inputs.on_surface or share > ENOUGH:
+        log.info("%s", density)
+        return
+    log.warning(
+        "%s: a point falls into %.0f %% of the pixels, and the others get no label. "
+        "project.recipe: surface labels pixels between points, too",
+        density,
+        share,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Makes the blocks (rows, cols) of a view's grid; plain values, for other processes."""
+
+    scene: SceneInputs
+    max_points: int
+
+    def key(self, content: str, rows: slice, cols: slice) -> str:
+        """Digest of all that the labels of a block follow from: ``content`` and its points."""
+        here = self.scene.pair.cols(cols)
+        points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(rows, here))
+        surface = [block.sha256 for block in self.scene.surface_blocks(rows, here)]
+        return digest({"content": content, "points": points, "surface": surface})
+
+    def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
+        """Label one block and write it, with its pixels by status and what is COUNTED.
+
+        Nothing, if it is there: a Dask worker that is lost takes with it that it had written it.
+        """
+        if out.has((rows, cols), key):
+            return
+        here = self.scene.pair.cols(cols)
+        shape = rows.stop - rows.start, cols.stop - cols.start
+        fill = layers(self.scene.settings, self.scene.view, self.scene.has_masks)
+        arrays: dict[str, NDArray] = {}
+        counted = np.zeros(len(COUNTED), dtype=np.int64)
+        for r, c in self.scene.windows.parts(rows, here, self.max_points):
+            labelled = label_window(self.scene, r, c)
+            if labelled is None:
+                continue
+            values, counts = labelled
+            part = (
+                slice(r.start - rows.start, r.stop - rows.start),
+                slice(c.start - here.start, c.stop - here.start),
+            )
+            for name, layer in values.items():
+                if name not in arrays:
+                    arrays[name] = np.full(shape, fill[name].fill, dtype=layer.dtype)
+                arrays[name][part] = layer
+            counted += counts
+        image = self.scene.pair.images[0]
+        if isinstance(image, MaskedImage) and (masked := image.mask[rows, here] != 0).any():
+            arrays.setdefault("status", np.full(shape, fill["status"].fill, np.uint8))
+            for name, array in arrays.items():
+                array[masked] = Status.MASKED if name == "status" else fill[name].fill
+        arrays = self.scene.pair.arrays(arrays)
+        status = arrays.get("status", np.zeros(shape, dtype=np.uint8))
+        pixels = np.bincount(status.reshape(-1), minlength=len(Status))
+        out.write((rows, cols), key, arrays, [*pixels.tolist(), *counted.tolist()])
+
+
+def _identity(attrs: Mapping[str, Any]) -> str:
+    """What stands for the values of a store; something new each time if it has no record.
+
+    Of points, what was read of their file belongs to it.
+    """
+    made_of = attrs.get("provenance") or {"unknown": os.urandom(8).hex()}
+    return attrs.get("content") or digest({**made_of, "points": attrs.get("cells_crc32")})
+
+
+@dataclass(frozen=True, eq=False)
+class _Extent:
+    """Where a scene's points and images are: boxes (west, south, east, north, degrees), ``heights``
+    (lowest, highest, m) of the points, folder of these."""
+
+    points: tuple[float, ...]
+    images: tuple[float, ...]
+    heights: tuple[float, float]
+    folder: Path
+
+    @classmethod
+    def of(cls, inputs: SceneInputs) -> _Extent:
+        """Raises InputError where the images reach no ground."""
+        (rows, cols), stores = inputs.pair.model.shape, inputs.stores
+        corners = np.array([store.bounds for store in stores])
+        points = *corners[:, :2].min(0).tolist(), *corners[:, 2:4].max(0).tolist()
+        heights = float(corners[:, 4].min()), float(corners[:, 5].max())
+        images = inputs.windows.ground_box(slice(0, rows), slice(0, cols), *heights)
+        if images is None:
+            raise InputError(
+                "the epipolar model reaches no ground",
+                file=inputs.left_store,
+                remedy="run rectify again",
+            )
+        return cls(points, images, heights, stores[0].path.parent)
+
+    def refuse(self) -> NoReturn:
+        """InputError: the points lie elsewhere."""
+        refuse_apart(self.points, self.images, self.heights, self.folder)
+
+
+def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> dict[str, Any]:
+    """Attributes of a scene's grid, but for the summary."""
+    stores = {"left": require_complete(inputs.left_store).attrs}
+    stores["right"] = require_complete(inputs.right_store).attrs
+    epipolar = dict(stores["left"]["epipolar"])
+    stores |= {f"points/{store.path.name}": store.attrs for store in inputs.stores}
+    if inputs.on_surface:
+        stores["surface"] = inputs.ground.attrs
+    made_of = {name: digest(dict(attrs.get("provenance", {}))) for name, attrs in stores.items()}
+    if inputs.alignment is not None:
+        made_of |= checksums([inputs.alignment])
+    parameters = _parameters(inputs)
+    return {
+        "kind": "disparity",
+        "scene": scene,
+        "view": inputs.view,
+        "epipolar": epipolar,
+        "points_bounds": [*extent.points, *extent.heights],
+        "alignment_sigma_px": inputs.pair.uncertainty.sigma,
+        "points_per_m2": round(inputs.points_per_m2, 4),
+        "points_per_px": round(inputs.points_per_m2 * inputs.rays.pixel_m**2, 4),
+        "points_bounds_order": "lon_min, lat_min, lon_max, lat_max (degrees), "
+        "height_min, height_max (m, ellipsoidal)",
+        "lidar": lidar_read(inputs, EpipolarModel.from_dict(epipolar)),
+        "settings": parameters,
+        "light": None if inputs.light is None else asdict(inputs.light),
+        "provenance": describe(made_of, parameters, code),
+    }
+
+
+def _parameters(inputs: SceneInputs) -> dict[str, Any]:
+    """Of a scene's labels: its view and the settings."""
+    return {"view": inputs.view} | inputs.settings.model_dump()
+
+
+def _content(inputs: SceneInputs, code: str) -> str:
+    """Digest of all that the labels follow from but the points."""
+    left, right = (require_complete(p).attrs for p in (inputs.left_store, inputs.right_store))
+    parameters = _parameters(inputs)
+    if inputs.on_surface:
+        parameters["scale"] = asdict(inputs.scale)
+    return digest(
+        {
+            "images": [_identity(left), _identity(right)],
+            "epipolar": left["epipolar"],
+            "uncertainty": inputs.pair.uncertainty.content,
+            "edge_margin_px": inputs.edge_margin_px,
+            "parameters": parameters,
+            "code": code,
+        }
+    )
+
+
+def project_scene(
+    inputs: SceneInputs,
+    out: str | Path,
+    *,
+    code: str,
+    scene: str = "",
+    workers: int = 1,
+    scheduler: Any = dask.threaded.get,
+    max_points: int = MAX_POINTS,
+    strip: Strip | None = None,
+) -> dict[str, Any] | None:
+    """Project the points of a scene and write its disparity grid; returns the summary.
+
+    ``inputs``: see :meth:`.SceneInputs.of`. ``code``: digest of the source, for the provenance.
+    ``scheduler`` is what Dask's compute takes; ``workers`` the number of its threads.
+
+    Blocks that an earlier call has left, made of the same, are taken over (see
+    :mod:`stereotruth.core.products.resumable_grids`). ``strip``: make its blocks only, for a later
+    call without it, and return None.
+
+    The store [y, x] on the epipolar grid of the view: see :func:`.layers.layers`; attributes
+    ``epipolar`` (the model), ``view``, ``summary``, ``points_bounds``, ``alignment_sigma_px``
+    (standard uncertainty of a ground point's disparity, x and y: medians), ``provenance``. Summary:
+    ``pixels`` by status, ``points`` (in the grid, in both frames, used), ``labelled_share`` of the
+    pixels that have points. Of the recipe surface also how many pixels were ``asked`` whether they
+    have changed, and the share of these that lies ``beyond_learned``, by each figure of
+    :class:`.change_evidence.Evidence`.
+
+    Raises InputError if no point falls into both images.
+    """
+    out = Path(out).absolute()
+    if not inputs.point_stores:
+        raise InputError("no point store", file=out, remedy="give the scene's LiDAR files")
+    extent = _Extent.of(inputs)
+    if apart(extent.points, extent.images) or not any(store.count for store in inputs.stores):
+        extent.refuse()
+    attrs = _attributes(inputs, extent, scene, code)
+    _log_density(inputs)
+    content = _content(inputs, code)
+    job = _Blocks(inputs, max_points)
+    shape = inputs.pair.model.shape
+    grid = resumable_grid(
+        out,
+        shape,
+        layers(inputs.settings, inputs.view, inputs.has_masks),
+        chunk=CHUNK,
+        shard=SHARD,
+        shared=strip is not None,
+    )
+    with grid as unfinished:
+        every = blocks(shape, SHARD)
+        part = every if strip is None else strip.of(every)
+        keys = [job.key(content, *block) for block in part]
+        tasks = [
+            dask.delayed(job.make, pure=False)(
+                unfinished, keys[number], *part[number], dask_key_name=f"block-{number:07d}"
+            )
+            for number in unfinished.missing(part, keys, workers)
+        ]
+        if tasks and inputs.on_surface:
+            _ = inputs.noise  # once, and not by each of the threads
+        with block_progress(len(tasks), "disparity"):
+            dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
+        if strip is not None:
+            return None
+        summary = _summary(inputs, np.sum(unfinished.results(every), axis=0).tolist())
+        if summary["points"]["in_frame"] == 0:
+            extent.refuse()
+        unfinished.write_atomically(out, every, attrs | {"summary": summary})
+    _log_summary(inputs.settings.recipe, summary)
+    return summary
+
+
+def _summary(inputs: SceneInputs, counts: list[int]) -> dict[str, Any]:
+    """Of pixels by status and what is counted (see :meth:`_Blocks.make`)."""
+    pixels = {status.label: counts[status] for status in inputs.statuses}
+    counted = dict(zip(COUNTED, counts[len(Status) :]))
+    beyond = "no_points", "out_of_frame", "masked"
+    reached = sum(n for name, n in pixels.items() if name not in beyond)
+    labelled = sum(counts[status] for status in inputs.statuses if is_labelled(status))
+    out = {
+        "pixels": pixels,
+        "points": {name: counted[name] for name in COUNTED[:3]},
+        "labelled_share": round(labelled / max(reached, 1), 6),
+    }
+    if inputs.on_surface:
+        asked = max(counted["asked"], 1)
+        out["asked"] = counted["asked"]
+        out["beyond_learned"] = {n: round(counted[n] / asked, 4) for n in Evidence._fields}
+    return out
+
+
+def _log_summary(recipe: str, summary: Mapping[str, Any]) -> None:
+    """Log how many pixels have labels, and warn if these are few."""
+    pixels, share = summary["pixels"], summary["labelled_share"]
+    log.info(
+        "%s: %d pixels labelled, %.1f %% of those with points in both images (%s)",
+        recipe,
+        sum(n for name, n in pixels.items() if carries_label(name)),
+        100.0 * share,
+        ", ".join(f"{name} {n}" for name, n in pixels.items() if n and name != "labelled"),
+    )
+    if share < LEAST_LABELLED:
+        log.warning(
+            "only %.0f %% of the pixels with points are seen alike in both images: check the "
+            "vertical datum of the LiDAR (geoid in scenes.tsv), its CRS and the GCP residuals",
+            100.0 * share,
+        )
+    beyond = {n: v for n, v in summary.get("beyond_learned", {}).items() if v > FAR_BEYOND}
+    if beyond:
+        log.warning(
+            "what the images show differs from what changes were learned from: %s of the %d pixels "
+            "that do not agree closely. Look at what is `changed`, and at what is not",
+            ", ".join(f"{name} at {100.0 * share:.0f} %" for name, share in beyond.items()),
+            summary["asked"],
+        )

@@ -1,0 +1,276 @@
+"""What the labels of a scene are made of."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..align.aligned_pair import Alignment
+from ..align.label_uncertainty import LabelUncertainty
+from ..align.strip_uncertainty import with_strips
+from ..core.config.labels import LabelSettings
+from ..core.dates import acquisition_time
+from ..core.products.grids import require_complete
+from ..core.products.provenance import digest
+from ..core.status import Status, statuses_of
+from ..epipolar.image_noise import NoiseCurve, pair_noise
+from ..epipolar.model import EpipolarModel
+from ..lidar.density import points_per_m2
+from ..lidar.lattice import LATTICE_DEG
+from ..lidar.point_store import PointStore, open_stores
+from ..lidar.strip_offsets import StripOffsets
+from ..sensor.acquisition import Acquisition, by_sheet
+from ..sensor.pair_light import PairLight, pair_light
+from ..sensor.rpc import RPC
+from ..surface.make_surface import make_surface
+from ..surface.scale import PART
+from ..surface.surface_store import Block, SurfaceStore
+from .change_evidence import EVIDENCE_PX
+from .change_probability import MEANS_PX
+from .change_reasons import REASON_PX
+from .crowns import CROWN_REACH_PX
+from .ground_in_view import blocks_in_view
+from .image_patches import MaskedImage
+from .pixel_scale import PixelScale
+from .point_windows import PointWindows
+from .rays import Rays
+from .right_view import Pair, seen_from
+
+log = logging.getLogger("stereotruth")
+
+DAYS = 256  # of the points of a scene that have a number: 8 bits
+
+
+@dataclass(frozen=True, eq=False)
+class SceneInputs:
+    """The rectified images and point stores of a scene, and the settings of its labels.
+
+    Plain values, so that it can go to another process; what they stand for is opened when it is
+    asked for. ``view``: left, or right for the labels of the right image. ``alignment``: the JSON
+    file whose corrections the images were rectified with; without it, it counts as exact.
+    ``surface``: the store with the surface of the points; the recipe paper needs none. ``strips``:
+    the folder with what the strips of the points are off; without it, they count as exact.
+    ``light``: what has decided whether the images share it, None where the settings alone say it.
+    """
+
+    left_store: Path
+    right_store: Path
+    point_stores: tuple[Path, ...]
+    settings: LabelSettings
+    view: str = "left"
+    alignment: Path | None = None
+    surface: Path | None = None
+    strips: Path | None = None
+    light: PairLight | None = None
+
+    @classmethod
+    def of(
+        cls,
+        left_store: str | Path,
+        right_store: str | Path,
+        point_stores: Sequence[str | Path],
+        settings: LabelSettings,
+        view: str = "left",
+        alignment: str | Path | None = None,
+        surface: str | Path | None = None,
+        strips: str | Path | None = None,
+    ) -> SceneInputs:
+        """With absolute paths, since workers of a Dask cluster live in other folders, and the point
+        stores in their order by name."""
+        left, right = Path(left_store).absolute(), Path(right_store).absolute()
+        points = tuple(sorted(Path(path).absolute() for path in point_stores))
+        more = (None if p is None else Path(p).absolute() for p in (alignment, surface, strips))
+        return cls(left, right, points, settings, view, *more)
+
+    def with_surface(self, folder: str | Path, workers: int = 1) -> SceneInputs:
+        """The same with the surface of all its points, which is made in a ``folder`` by the pixel
+        of its left image: for a pair that is of no project."""
+        if not self.on_surface:
+            return self
+        names = digest(list(map(str, self.point_stores)))[:12]
+        out = Path(folder).absolute() / f"{names}.surface"
+        model = EpipolarModel.from_dict(require_complete(self.left_store).attrs["epipolar"])
+        make_surface(self.stores, out, cell=Rays.of(model).cell, workers=workers)
+        return replace(self, surface=out)
+
+    def in_light(
+        self, diachronic: bool | None, cells: Mapping[str, tuple[str, float | None, float | None]]
+    ) -> SceneInputs:
+        """The same with ``settings.diachronic`` as :func:`.pair_light` decides it: by what the
+        scenes sheet says of ``diachronic``, and by date and sun of both images.
+
+        ``cells`` by view: acquired, sun_azimuth and sun_elevation of the images sheet (empty
+        and None where it has none), which go before the delivery.
+        """
+        stores = {"left": self.left_store, "right": self.right_store}
+        attrs = {view: require_complete(store).attrs for view, store in stores.items()}
+        model = EpipolarModel.from_dict(attrs["left"]["epipolar"])
+        taken = [
+            _taken(attrs[view], cells[view], getattr(model, view).rpc) for view in ("left", "right")
+        ]
+        light = pair_light(*taken, Rays.of(model).pixel_m, diachronic, self.settings.diachronic)
+        log.info(
+            "%s, by the %s", "two lights" if light.diachronic else "one light", light.decided_by
+        )
+        settings = self.settings.model_copy(update={"diachronic": light.diachronic})
+        return replace(self, settings=settings, light=light)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in self.__dataclass_fields__}
+
+    @cached_property
+    def pair(self) -> Pair:
+        """The images with their geometry; its left image is the one that gets labels."""
+        return seen_from(self.view, self._pair)
+
+    @cached_property
+    def _pair(self) -> Pair:
+        """The same, as the images are read."""
+        left, right = (require_complete(path) for path in (self.left_store, self.right_store))
+        model = EpipolarModel.from_dict(left.attrs["epipolar"])
+        uncertainty = LabelUncertainty.none()
+        shared_px = 0.0
+        if self.alignment is not None:
+            alignment = Alignment.load(self.alignment)
+            uncertainty = LabelUncertainty.of(alignment, model, self.view)
+            shared_px = alignment.shared_px
+        if self.lidar_strips is not None:
+            how = model, self.view, shared_px
+            uncertainty = with_strips(uncertainty, self.lidar_strips, *how)
+        images = (
+            MaskedImage(group["image"], group["mask"]) if "mask" in group else group["image"]
+            for group in (left, right)
+        )
+        return Pair(tuple(images), model, uncertainty)
+
+    @cached_property
+    def lidar_strips(self) -> StripOffsets | None:
+        """What the strips of the points are off; None if they count as exact."""
+        return None if self.strips is None else StripOffsets.read(self.strips)
+
+    @cached_property
+    def edge_margin_px(self) -> float:
+        """Distance of a pixel's centre from the edge of its surface below which it has no label:
+        that of the settings, or how far the strips of the points are off in plan; a pixel at most,
+        beyond which points of the pixels around tell no edge."""
+        plan_m = self.lidar_strips.most_in_plan_m if self.lidar_strips else 0.0
+        return max(self.settings.edge_margin_px, min(plan_m / self.rays.pixel_m, 1.0))
+
+    @property
+    def on_surface(self) -> bool:
+        """Whether labels follow from the surface of the points."""
+        return self.settings.recipe == "surface"
+
+    @property
+    def images_window(self) -> int:
+        """Side in px of the window that both images must hold around a label; 1: its pixel."""
+        return 1 if self.on_surface else self.settings.window
+
+    @property
+    def margin(self) -> int:
+        """Pixels around a window whose points have a say in it."""
+        if not self.on_surface:
+            return 1  # the points' noise is pooled over 3 x 3 pixels
+        # what may hide a crown, farther off than the plane and the noise of a pixel's own points
+        # reach, and what the images tell of a pixel, and of those around
+        reach = CROWN_REACH_PX + MEANS_PX + max(EVIDENCE_PX, self.settings.window // 2 + 1)
+        return reach + REASON_PX  # of changes
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether a mask hides something of an image."""
+        return any(isinstance(image, MaskedImage) for image in self.pair.images)
+
+    @property
+    def statuses(self) -> list[Status]:
+        """Those that occur."""
+        return statuses_of(self.settings.recipe, self.has_masks)
+
+    @cached_property
+    def noise(self) -> tuple[NoiseCurve, NoiseCurve]:
+        """Of both images of the :attr:`pair`, by brightness."""
+        of_images = pair_noise(*self._pair.images, self._pair.model)
+        return of_images if self.view == "left" else of_images[::-1]
+
+    @cached_property
+    def rays(self) -> Rays:
+        """From the ground to both cameras."""
+        return Rays.of(self.pair.model)
+
+    @cached_property
+    def stores(self) -> tuple[PointStore, ...]:
+        """The points."""
+        return open_stores(self.point_stores)
+
+    @cached_property
+    def days(self) -> NDArray[np.uint16]:
+        """Days of the points since 1970-01-01, in their order behind a 0 for not known.
+
+        The first 255 of them: points of further days count as of none.
+        """
+        every = np.concatenate([[0], *(store.days for store in self.stores)])
+        return np.unique(every)[:DAYS].astype(np.uint16)
+
+    @cached_property
+    def day_numbers(self) -> NDArray[np.uint8]:
+        """Index of each day [65536] in :attr:`days`."""
+        numbers = np.zeros(1 << 16, np.uint8)
+        numbers[self.days] = np.arange(self.days.size)
+        return numbers
+
+    @cached_property
+    def scale(self) -> PixelScale:
+        """What a pixel is on the ground and in height."""
+        return PixelScale.of(self.ground.scale, self.rays)
+
+    @cached_property
+    def points_per_m2(self) -> float:
+        """Over the ground that the points cover, as far as the site's images show it."""
+        return self.ground.points_per_m2 if self.on_surface else points_per_m2(self.stores)
+
+    @cached_property
+    def ground(self) -> SurfaceStore:
+        """The surface of the points."""
+        return SurfaceStore(self.surface)
+
+    @cached_property
+    def windows(self) -> PointWindows:
+        """Where the points of windows of the pair's left image are."""
+        reach = (0.0, 0.0)
+        if self.on_surface:
+            scale = self.ground.scale
+            reach = tuple(scale.height_reach / PART * side * LATTICE_DEG for side in scale.cell)
+        return PointWindows(self.pair.model, self.rays, self.stores, self.margin, reach)
+
+    def surface_blocks(self, rows: slice, cols: slice) -> tuple[Block, ...]:
+        """Blocks of the surface that a window shows, or that may hide this."""
+        footprint = self.windows.footprint(rows, cols)
+        if footprint is None or not self.on_surface:
+            return ()
+        margin = self.margin
+        first = rows.start - margin, cols.start - margin
+        shape = rows.stop - rows.start + 2 * margin, cols.stop - cols.start + 2 * margin
+        return blocks_in_view(self.ground.blocks(footprint.around), self.pair.model, first, shape)
+
+
+def _taken(
+    attrs: Mapping[str, Any], cells: tuple[str, float | None, float | None], rpc: RPC
+) -> Acquisition:
+    """When and by which sun a rectified image was taken, by its attributes (see
+    :func:`.rectify.rectify`) and the cells of the images sheet."""
+    time, sun = attrs.get("taken"), attrs.get("sun")
+    delivery = Acquisition(
+        datetime.fromisoformat(time) if time else None, tuple(sun) if sun else None
+    )
+    acquired, azimuth, elevation = cells
+    by_row = None if azimuth is None or elevation is None else (azimuth, elevation)
+    lon_lat = float(rpc.long_off), float(rpc.lat_off)
+    return by_sheet(delivery, acquisition_time(acquired) if acquired else None, by_row, lon_lat)

@@ -1,0 +1,262 @@
+"""A scene's row from a delivery: images, RPCs and views found, LiDAR looked at, sheets written."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+
+from ..align.control_points import ControlPoints, read_gcps
+from ..align.gcp_checks import fit_exchanged, misfits_of_sides
+from ..core import sheets
+from ..core.errors import InputError
+from ..core.products.files import atomic_file
+from ..epipolar.fit import fit_epipolar
+from ..epipolar.model import EpipolarModel
+from ..lidar.catalogue_list import is_catalogue, write_list
+from ..lidar.overlap_check import apart, refuse_apart
+from .check_lidar import check_lidar
+from .check_scene import boxes_of, ground_of
+from .check_tiles import Nodes, check_frame
+from .deliveries import Image, find_pair
+from .findings import Findings, Level
+from .list_tiles import list_tiles, margin_of
+from .project import configured, sheet, with_stand_ins
+
+SPLITS = {"training": 6, "validation": 1, "testing": 3}  # weights of a new city
+
+
+def add_scene(
+    delivery: Sequence[Path],
+    *,
+    lidar: str,
+    gcps: str = "",
+    city: str = "",
+    name: str = "",
+    lidar_crs: str = "",
+    geoid: str = "",
+    hosts: Sequence[str] = (),
+    configfiles: Sequence[Path] | None = None,
+) -> list[str]:
+    """Append the scene's row to the scenes sheet, and its city's if it is new.
+
+    ``lidar`` may be a catalogue: its tiles are listed (:mod:`.list_tiles`), ``hosts`` may be led
+    to. Returns what was found, line by line. Raises InputError if there is no usable pair, LiDAR or
+    file, before anything is written.
+    """
+    settings, _ = configured(configfiles)
+    rows, towns = (Path(sheet(settings, kind)) for kind in ("scenes", "cities"))
+    cities = sheets.read_cities(towns)
+    scenes = sheets.read_scenes(rows, cities)
+    pair, lines = find_pair(delivery)
+    _refuse_repeated(pair, scenes, rows)
+    city = city or _word(_folder_name(delivery))
+    name = name or _unused(city, scenes)
+    if name in scenes:
+        raise InputError(
+            f"scene {name!r} is there already", file=rows, remedy="take another --name"
+        )
+    if is_catalogue(lidar):
+        images = [(str(pair[0].path), str(pair[1].path))]
+        listed, more = list_tiles(lidar, images, margin_of(settings), frozenset(hosts))
+        lidar, lidar_crs = f"lidar/{name}.tsv", lidar_crs or listed.crs
+        write_list(listed, lidar)
+        lines += more
+    cells = {
+        "scene": name,
+        "city": city,
+        "left_image": str(pair[0].path),
+        "right_image": str(pair[1].path),
+        "lidar": lidar,
+        "lidar_crs": lidar_crs,
+        "geoid": geoid,
+        "gcps": gcps,
+    }
+    scene = sheets.check(cells, sheets.Scene, f"scene {name}")
+    sheets.require_files(scene, rows, sheets.FILES)
+    found = Findings(name)
+    placed = with_stand_ins(scene, ask=True)
+    footprint = ground_of(placed, settings)
+    surveyed = check_lidar(sheets.find_lidar(placed, rows), scene, found, footprint)
+    for finding in found:
+        if finding.level is Level.ERROR:
+            raise InputError(finding.text, remedy=_as_options(finding.remedy))
+    heights = [height for file in surveyed for height in file.heights or ()]
+    points = read_gcps(gcps, name) if gcps else None
+    height = float(np.mean(heights)) if heights else None
+    pair, model, words = in_order(pair, height, points)
+    placed = [file for file in surveyed if file.box and file.heights]
+    if placed:
+        lidar_box, images_box, range_m = boxes_of(placed, Nodes.of(model))
+        if apart(lidar_box, images_box):
+            refuse_apart(lidar_box, images_box, range_m, placed[0].path.parent)
+    cells |= {"left_image": str(pair[0].path), "right_image": str(pair[1].path)}
+    check_frame(Nodes.of(model), settings, found)
+    lines += words
+    for finding in found:
+        remedy = f". Remedy: {finding.remedy}" if finding.remedy else ""
+        lines.append(f"{finding.about}: {finding.text}{remedy}")
+    if city not in cities:
+        made = sheets.check(
+            {"city": city, "prefix": _prefix(city, cities), **SPLITS}, sheets.City, f"city {city}"
+        )
+        append_row(towns, sheets.City, asdict(made))
+        lines.append(f"{towns}: city {city}, tiles named {made.prefix}_…, split 6 : 1 : 3")
+    append_row(rows, sheets.Scene, cells)
+    lines.append(f"{rows}: scene {name} of {city}. Next: stereotruth check {name}")
+    return lines
+
+
+def _refuse_repeated(
+    pair: tuple[Image, Image], scenes: Mapping[str, sheets.Scene], rows: Path
+) -> None:
+    """Raise InputError if a scene of the sheet has the same two images."""
+    images = {sheets.file_key(str(image.path)) for image in pair}
+    for name, scene in scenes.items():
+        if images == {sheets.file_key(scene.left_image), sheets.file_key(scene.right_image)}:
+            raise InputError(
+                f"scene {name!r} has these two images already",
+                file=rows,
+                remedy=f"stereotruth check {name}; or stereotruth scene remove {name}, then add it",
+            )
+
+
+def in_order(
+    pair: tuple[Image, Image], height: float | None, points: ControlPoints | None = None
+) -> tuple[tuple[Image, Image], EpipolarModel, list[str]]:
+    """Left first, and how that is known.
+
+    By what the files' names or the user say; else by the control ``points``, whose columns belong
+    to one image each; else left is the backward view by the RPCs. ``height`` of the ground, m;
+    None: the middle of the RPCs' own. The model is that of the RPCs as they are, of the images as
+    given. Raises InputError if control points contradict the names.
+    """
+    one, other = pair
+    is_named = bool(one.view and other.view)
+    known_by = "by the names" if is_named else "by the RPCs"
+    if points is not None:
+        given, exchanged = misfits_of_sides(points, (one.sensor, other.sensor))
+        by_points = fit_exchanged(given, exchanged) or fit_exchanged(exchanged, given)
+        if fit_exchanged(given, exchanged):
+            if is_named:
+                raise InputError(
+                    f"control points miss by {given:.0f} px with {one.path.name} as left image, by "
+                    f"{exchanged:.1f} px with {other.path.name}",
+                    file=points.file,
+                    remedy=f"stereotruth scene add {other.path} {one.path} …; or exchange the left "
+                    "and right columns of the control points",
+                )
+            one, other = other, one
+        if by_points:
+            is_named, known_by = True, "by the control points"
+    if height is None:
+        height = float(one.sensor.rpc.height_off + other.sensor.rpc.height_off) / 2
+    model = fit_epipolar(
+        one.sensor,
+        other.sensor,
+        one.size,
+        other.size,
+        height,
+        names=(str(one.path), str(other.path)),
+    )
+    order, angle = model.report["view_order"], model.report["convergence_angle_deg"]
+    forward = order == "left looks forward"
+    if forward and not is_named:
+        one, other = other, one
+        order = "left looks backward"
+    words = f"convergence {angle:.1f} degrees; sides {known_by}; by the RPCs, {order}"
+    if order == "left looks forward":
+        words += " (the backward view is left in the paper's data)"
+    return (one, other), model, [f"left: {one.path}", f"right: {other.path}", words]
+
+
+def _folder_name(delivery: Sequence[Path]) -> str:
+    first = delivery[0].absolute()
+    return (first if first.is_dir() else first.parent).name
+
+
+def _word(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9-]+", "-", text).strip("-") or "City"
+
+
+def _unused(city: str, scenes: dict[str, sheets.Scene]) -> str:
+    """The first of City-1, City-2 … that no scene has."""
+    base = re.sub(r"[^A-Za-z0-9-]", "-", city)
+    return next(name for k in range(1, 10_000) if (name := f"{base}-{k}") not in scenes)
+
+
+def _prefix(city: str, cities: dict[str, sheets.City]) -> str:
+    """Two letters or more of the city that no other has."""
+    letters = re.sub(r"[^A-Za-z0-9]", "", city).upper() or "C"
+    taken = {other.prefix for other in cities.values()}
+    options = [letters[0] + other for other in letters[1:]]
+    options += [f"{letters[:2]}{k}" for k in range(2, 1000)]
+    return next(option for option in options if option not in taken)
+
+
+def _as_options(remedy: str) -> str:
+    """A remedy of the sheets in the words of this command."""
+    for column in ("lidar_crs", "geoid"):
+        remedy = re.sub(rf"\b{column}\b", f"--{column.replace('_', '-')}", remedy)
+    return remedy
+
+
+def list_scenes(configfiles: Sequence[Path] | None = None) -> list[str]:
+    """A line for each scene of the sheet: name, city, images."""
+    settings, _ = configured(configfiles)
+    rows = Path(sheet(settings, "scenes"))
+    scenes = sheets.read_scenes(rows, sheets.read_cities(sheet(settings, "cities")))
+    if not scenes:
+        return [f"{rows}: no scene. Next: stereotruth scene add DELIVERY --lidar FOLDER"]
+    width = max(map(len, scenes))
+    return [
+        f"{name:{width}}  {scene.city}: {scene.left_image}, {scene.right_image}, {scene.lidar}"
+        for name, scene in scenes.items()
+    ]
+
+
+def remove_scene(name: str, configfiles: Sequence[Path] | None = None) -> str:
+    """Take the row of a scene out of its sheet; its products stay. Raises InputError without one.
+
+    Other lines, remarks among them, stay as they are.
+    """
+    settings, _ = configured(configfiles)
+    file = Path(sheet(settings, "scenes"))
+    lines = file.read_text(encoding="utf-8-sig").splitlines(keepends=True)
+    begin = next(k for k, line in enumerate(lines) if line.strip() and not line.startswith("#"))
+    column = [cell.strip() for cell in lines[begin].split("\t")].index("scene")
+    kept = [
+        line
+        for k, line in enumerate(lines)
+        if k <= begin or line.startswith("#") or _cell(line, column) != name
+    ]
+    if len(kept) == len(lines):
+        raise InputError(
+            f"no scene {name!r}", file=file, remedy="stereotruth scene list names all of them"
+        )
+    with atomic_file(file) as scratch:
+        scratch.write_text("".join(kept), encoding="utf-8")
+    return f"{file}: scene {name} taken out; what was made of it stays under results/ and tiles/"
+
+
+def _cell(line: str, column: int) -> str:
+    cells = line.rstrip("\r\n").split("\t")
+    return cells[column].strip() if column < len(cells) else ""
+
+
+def append_row(file: Path, kind: type, cells: dict[str, object]) -> None:
+    """One more line of a sheet, in the order of its own header."""
+    text = file.read_text(encoding="utf-8-sig")
+    header = next(
+        (line.split("\t") for line in text.splitlines() if line and not line.startswith("#")),
+        [field.name for field in fields(kind)],
+    )
+    row = {column.strip(): cells.get(column.strip(), "") for column in header}
+    with file.open("a", newline="", encoding="utf-8") as stream:
+        if text and not text.endswith("\n"):
+            stream.write("\n")
+        csv.writer(stream, delimiter="\t", lineterminator="\n").writerow(row.values())

@@ -1,0 +1,163 @@
+"""Everything that can be known before a run, by the checks of the stages that would refuse it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from time import monotonic
+
+from stereocities.cities import city_of, file_of
+
+from ..core.config.configuration import Configuration
+from ..core.errors import InputError
+from ..core.sheets import Scene
+from ..lidar.frames import Epoch
+from ..tiles.windows import cell_step
+from .check_scene import Looked, SceneFacts, check_scene
+from .epochs import epoch_of_city
+from .findings import Findings, Level
+from .project import (
+    adjusted_scenes,
+    check_fixed,
+    configured,
+    is_synthetic,
+    names_in_pair,
+    read_images,
+    read_scenes,
+    require_scenes,
+    sheet,
+)
+from .resources import check_resources
+from .run_workflow import duration
+from .site import check_images, check_links, scene_pairs
+
+TIMED = 3  # scenes by which the time of the others is known
+MOMENT_S = 10.0  # that needs no word
+
+
+def chosen(
+    names: Iterable[str], scenes: dict[str, Scene], cities: Iterable[str], rows: str
+) -> dict[str, Scene]:
+    """The scenes that names of scenes or cities stand for; all without names.
+
+    Raises InputError for a name that neither sheet has.
+    """
+    names, cities = list(names), set(cities)
+    unknown = [name for name in names if name not in scenes and name not in cities]
+    if unknown:
+        known = ", ".join([*scenes, *sorted(cities)]) or "none, as the sheets are empty"
+        raise InputError(
+            f"no scene or city {unknown[0]!r}", file=rows, remedy=f"take of these: {known}"
+        )
+    return {
+        name: scene
+        for name, scene in scenes.items()
+        if not names or name in names or scene.city in names
+    }
+
+
+def check_project(
+    configfiles: Sequence[Path] | None = None,
+    names: Sequence[str] = (),
+    tell: Callable[[str], object] = lambda text: None,
+) -> list[Findings]:
+    """Findings of the sheets, of each scene, and of what the run will take, in this order.
+
+    ``tell`` is called after the first scenes, if all others take more than a moment.
+    """
+    project = Findings("project")
+    settings = scenes = None
+    with project.of("configuration"):
+        require_scenes(configfiles)
+        settings, files = configured(configfiles)
+        project.say("configuration", Level.FACT, files)
+        tiles = settings.tiles
+        cell_step(tiles.size, tiles.stride or tiles.size)
+    if settings is None:
+        return [project]
+    with project.of("sheets"):
+        cities, every_scene = read_scenes(settings)
+        rows = sheet(settings, "scenes")
+        images = read_images(settings, cities)
+        check_fixed(settings, every_scene, images)
+        found = chosen(names, every_scene, cities, rows)
+        if not found:
+            raise InputError(
+                "no scene in it", file=rows, remedy="stereotruth scene add DELIVERY --lidar FOLDER"
+            )
+        scenes = found
+        project.say("sheets", Level.FACT, _counted(scenes))
+    if scenes is None:
+        return [project]
+    in_sheet = {name: names_in_pair(scene, images) for name, scene in every_scene.items()}
+    adjusted = adjusted_scenes(settings, every_scene, in_sheet)
+    every, facts = [project], []
+    looked: Looked = {}
+    epochs: dict[str, Epoch] = {}
+    began = monotonic()
+    for k, (name, scene) in enumerate(scenes.items()):
+        if k == TIMED:
+            _tell_time(tell, (monotonic() - began) / TIMED, len(scenes) - TIMED)
+        found = Findings(name)
+        if is_synthetic(scene):
+            _check_synthetic(scene, found)
+        else:
+            alone = name not in adjusted
+            epoch = epochs.get(scene.city)
+            if epoch is None:
+                epoch = epochs[scene.city] = epoch_of_city(cities[scene.city], every_scene, images)
+            names = in_sheet[name]
+            facts.append(
+                check_scene(scene, settings, found, names, alone=alone, looked=looked, epoch=epoch)
+            )
+        every.append(found)
+    if settings.images:
+        towns = sorted({scene.city for scene in scenes.values()})
+        of_images = check_images(settings, images, scenes.values(), towns)
+        for town in towns:
+            check_links(town, images, scene_pairs(town, every_scene, images), of_images)
+        every.insert(1, of_images)
+    every.append(_run(facts, settings))
+    return every
+
+
+def _tell_time(tell: Callable[[str], object], scene_s: float, left: int) -> None:
+    """Say how long the scenes that are left take by those before, if it is more than a moment."""
+    if scene_s * left > MOMENT_S:
+        tell(
+            f"looking at {left} more scenes, about {duration(scene_s * left)}; "
+            "stereotruth check SCENE … looks at some"
+        )
+
+
+def _check_synthetic(scene: Scene, found: Findings) -> None:
+    """What a run makes needs nothing but the files of the place that a city is the twin of."""
+    with found.of("input"):
+        city = city_of(scene.city)
+        words = "images, LiDAR and truth are made by the run"
+        if city.twin is None:
+            found.say("input", Level.FACT, f"synthetic: {words}")
+            return
+        for file in city.twin.files:
+            if not Path(file).is_file():
+                raise InputError(
+                    "there is no such file, of which the city is the twin",
+                    file=file,
+                    remedy=f"put it back, or correct its path in {file_of(city.name)}",
+                )
+        found.say("input", Level.FACT, f"twin of {city.twin.file}: {words}")
+
+
+def _run(facts: Sequence[SceneFacts], settings: Configuration) -> Findings:
+    found = Findings("run")
+    with found.of("resources"):
+        check_resources([fact for fact in facts if fact.pixels], settings, found)
+    return found
+
+
+def _counted(scenes: dict[str, Scene]) -> str:
+    cities = len({scene.city for scene in scenes.values()})
+    return (
+        f"{len(scenes)} scene{'s' * (len(scenes) != 1)} of {cities} "
+        f"{'city' if cities == 1 else 'cities'}"
+    )

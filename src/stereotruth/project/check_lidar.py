@@ -1,0 +1,115 @@
+"""The LiDAR of a scene by its headers."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from ..core.dates import epoch_year
+from ..core.errors import InputError, in_number, in_words
+from ..core.products.remote_files import url_of
+from ..core.sheets import Scene
+from ..lidar.footprint import Footprint
+from ..lidar.frames import Epoch, Epochs
+from ..lidar.geoid_candidates import candidates_at, named
+from ..lidar.survey import SurveyedFile, survey
+from .findings import Findings, Level
+
+AT_ONCE = 8  # files of servers that are looked at
+NO_DATUM = (
+    "declares no vertical datum",
+    "if they are orthometric, set geoid to a grid of their datum for this scene",
+)
+
+
+def check_lidar(
+    files: Sequence[Path],
+    scene: Scene,
+    found: Findings,
+    footprint: Footprint | None = None,
+    epoch: Epoch | None = None,
+) -> list[SurveyedFile]:
+    """The files that can be read, after what is to be said of all of them was added.
+
+    ``footprint``: the ground of which a run reads them; None: all. ``epoch``: of the city's places.
+    """
+    how = {"lidar_crs": scene.lidar_crs or None, "geoid": scene.geoid or None}
+    if epoch is not None:
+        how["epochs"] = Epochs(epoch, epoch_year(scene.lidar_epoch))
+
+    def look(file: Path) -> SurveyedFile | InputError:
+        try:
+            with in_words():
+                return survey(file, footprint=footprint, **how)
+        except InputError as error:
+            return error
+
+    remote = any(url_of(file) for file in files)
+    with ThreadPoolExecutor(AT_ONCE if remote else 1) as pool:
+        looked = list(pool.map(look, files))
+    surveyed = [item for item in looked if isinstance(item, SurveyedFile)]
+    errors = [item for item in looked if isinstance(item, InputError)]
+    for problem, (error, count) in _by_text(errors).items():
+        name = error.file or "LiDAR"
+        more = f" (and {count - 1} more files)" if count > 1 else ""
+        found.say("LiDAR", Level.ERROR, f"{name}{more}: {problem}", error.remedy)
+    notes = Counter(note for file in surveyed for note in file.notes)
+    for note, count in notes.items():
+        of = "" if count == len(files) == 1 else f"{count} of {len(files)} files: "
+        remedy = _geoids(surveyed) if NO_DATUM[0] in note else ""
+        found.say("LiDAR", Level.DOUBT, f"{of}{note}", remedy)
+    surfaces = Counter(file.surface for file in surveyed)
+    systems = Counter(file.system for file in surveyed)
+    for what, kinds in (("heights", surfaces), ("systems", systems)):
+        if len(kinds) > 1:
+            said = "; ".join(f"{count}: {kind}" for kind, count in kinds.items())
+            found.say("LiDAR", Level.DOUBT, f"files differ in their {what} ({said})")
+    if surveyed:
+        points = sum(file.points for file in surveyed)
+        placed = [file.heights for file in surveyed if file.heights]
+        reach = dense = ""
+        if area := sum(file.area_m2 for file in surveyed):
+            dense = f", at least {points / area:.2g} points/m² (over the boxes of their headers)"
+        if placed:
+            reach = f", {min(h[0] for h in placed):.0f} to {max(h[1] for h in placed):.0f} m"
+        found.say(
+            "LiDAR",
+            Level.FACT,
+            f"{points / 1e6:.1f} M points in {len(surveyed)} "
+            f"file{'s' * (len(surveyed) > 1)}{dense}, {next(iter(systems))}; heights "
+            f"{next(iter(surfaces))}{reach}",
+        )
+        if footprint is not None:
+            _say_what_is_read(surveyed, found)
+    return surveyed
+
+
+def _geoids(surveyed: Sequence[SurveyedFile]) -> str:
+    """What to do about undeclared heights, with the geoids that there are of the place."""
+    box = next((file.box for file in surveyed if file.box), None)
+    of_place = candidates_at((box[0] + box[2]) / 2, (box[1] + box[3]) / 2) if box else []
+    return NO_DATUM[1] + (f"; of the place PROJ knows {named(of_place)}" if of_place else "")
+
+
+def _say_what_is_read(surveyed: Sequence[SurveyedFile], found: Findings) -> None:
+    """How much of the files a run reads."""
+    touched = sum(file.read[0] > 0 for file in surveyed)
+    points, size = (sum(file.read[k] for file in surveyed) for k in (0, 1))
+    every = sum(file.points for file in surveyed), sum(file.bytes for file in surveyed)
+    found.say(
+        "LiDAR",
+        Level.FACT,
+        f"a run reads {touched} of {in_number(len(surveyed), 'file')}, {points / 1e6:.1f} of "
+        f"{every[0] / 1e6:.1f} M points, {size / 1e6:.1f} of {every[1] / 1e6:.1f} MB",
+    )
+
+
+def _by_text(errors: Sequence[InputError]) -> dict[str, tuple[InputError, int]]:
+    """First error and number of errors of each problem."""
+    counts = Counter(error.problem for error in errors)
+    return {
+        problem: (next(e for e in errors if e.problem == problem), count)
+        for problem, count in counts.items()
+    }

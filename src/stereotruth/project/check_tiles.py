@@ -1,0 +1,224 @@
+"""Which tiles go into what both images show, and what share of their pixels will have a label."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.config.configuration import Configuration
+from ..core.errors import in_number
+from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.summed_area import summed_area, window_sums
+from ..epipolar.model import EpipolarModel
+from ..lidar.survey import SurveyedFile
+from ..tiles.windows import cell_step
+from .estimates import estimates
+from .findings import Findings, Level
+
+SUPPORT_PX = 2.0  # around a place, of an image that is resampled by cubic convolution
+NODES = 128  # along the longer side of the grid
+SMALL_HOLE_M2, SMALL_HOLE = 10_000, 0.001  # rims that are not worth a line: area, and share
+BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
+
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Places of the epipolar grid, ``step`` px apart: ``seen`` where both images show ground.
+
+    ``x``, ``y`` [rows, cols] px; the right image is taken as at the reference height.
+    """
+
+    model: EpipolarModel
+    step: float
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    seen: Bools
+
+    @classmethod
+    def of(cls, model: EpipolarModel) -> Nodes:
+        """Of a whole grid."""
+        rows, cols = model.shape
+        step = max(rows, cols) / NODES
+        axes = [np.arange(step / 2, side, step) - 0.5 for side in (cols, rows)]
+        x, y = np.meshgrid(*axes)
+        seen = np.ones(x.shape, bool)
+        for inverse, size in (
+            (model.epipolar_to_left, model.left_size),
+            (model.epipolar_to_right, model.right_size),
+        ):
+            place = inverse(x.ravel(), y.ravel())
+            for values, side in zip(place, size):
+                values = np.asarray(values).reshape(x.shape)
+                seen &= (values >= SUPPORT_PX) & (values <= side - 1 - SUPPORT_PX)
+        return cls(model, step, x, y, seen)
+
+    def ground(self, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """lon, lat [rows, cols] of the nodes at an ellipsoidal height in m."""
+        lon, lat = self.model.epipolar_to_ground(self.x.ravel(), self.y.ravel(), height)
+        return np.asarray(lon).reshape(self.x.shape), np.asarray(lat).reshape(self.x.shape)
+
+    def windows(self, values: NDArray, size: int) -> NDArray[np.float64]:
+        """Means of values over all squares of ``size`` px, [rows, cols] of their first nodes."""
+        n = max(round(size / self.step), 1)
+        return window_sums(values, n) / n**2
+
+    def windows_at(self, values: NDArray, size: int, step: int) -> NDArray[np.float64]:
+        """Means of values over all squares of ``size`` px whose origins are multiples of ``step``.
+
+        A square has all nodes whose cells it touches.
+        """
+        origins = [np.arange(0, side - size + 1, step) for side in self.model.shape]
+        (top, left), (bottom, right) = (
+            [((at + more) / self.step).astype(int) + end for at in origins]
+            for more, end in ((0, 0), (size - 1, 1))
+        )
+        bottom, right = (np.minimum(at, n) for at, n in zip((bottom, right), values.shape))
+        table = summed_area(values)
+        sums = table[np.ix_(bottom, right)] - table[np.ix_(top, right)]
+        sums = sums - table[np.ix_(bottom, left)] + table[np.ix_(top, left)]
+        return sums / ((bottom - top)[:, None] * (right - left)[None, :])
+
+    def fits(self, size: float) -> bool:
+        """Whether a square of that size lies in what both images show."""
+        means = self.windows(self.seen, int(size))
+        return bool(means.size and means.max() > 1 - 1e-9)
+
+    @property
+    def largest(self) -> int:
+        """Side of the largest square in px, a multiple of 32, 16 at least."""
+        fitting = [side for side in range(32, min(self.model.shape) + 1, 32) if self.fits(side)]
+        return fitting[-1] if fitting else 16
+
+
+def check_frame(nodes: Nodes, settings: Configuration, found: Findings) -> None:
+    """Refuse tiles that are larger than what both images show: all their pixels have to be seen."""
+    size, rows, cols = settings.tiles.size, *nodes.model.shape
+    if nodes.fits(size):
+        return
+    certain = not nodes.fits(size - 2 * nodes.step)
+    found.say(
+        "tiles",
+        Level.ERROR if certain else Level.DOUBT,
+        f"{'not one' if certain else 'maybe not one'} tile of {size} px lies wholly in what both "
+        f"images show of the {cols} x {rows} px grid",
+        f"set tiles.size to {nodes.largest} or less",
+    )
+
+
+def expected_share(points_per_px: float, recipe: str) -> float:
+    """Share of the pixels which both views see that will have a label."""
+    of = estimates()["labelled"]
+    return float(np.interp(points_per_px, [0.0, *of["points_per_px"]], [0.0, *of[recipe]]))
+
+
+def pixel_m2(model: EpipolarModel) -> float:
+    """Ground that a pixel in the middle of the grid shows, m²."""
+    rows, cols = model.shape
+    x, y = cols / 2 + np.array([0.0, 1.0, 0.0]), rows / 2 + np.array([0.0, 0.0, 1.0])
+    lon, lat = map(np.asarray, model.epipolar_to_ground(x, y, model.reference_height))
+    sides = np.stack([(lon[1:] - lon[0]) * np.cos(np.radians(lat[0])), lat[1:] - lat[0]])
+    return float(abs(np.linalg.det(sides * DEGREE_M)))
+
+
+def check_labels(
+    nodes: Nodes, placed: Sequence[SurveyedFile], settings: Configuration, found: Findings
+) -> float:
+    """Say what share of the pixels will be labelled, by the headers' boxes and counts.
+
+    ``placed``: files with box and heights. Returns the share of the images with LiDAR.
+    """
+    lon, lat = nodes.ground(float(np.mean([file.heights for file in placed])))
+    density = np.zeros(lon.shape)  # points a m², of the boxes that a node lies in
+    for file in placed:
+        west, south, east, north = file.box
+        inside = (lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)
+        density[inside] += file.points / max(file.area_m2, 1.0)
+    covered = nodes.seen & (density > 0)
+    share = float(covered.sum() / max(nodes.seen.sum(), 1))
+    if not share:
+        return 0.0
+    per_m2 = float(density[covered].mean())
+    per_px, recipe = per_m2 * pixel_m2(nodes.model), settings.project.recipe
+    expected = expected_share(per_px, recipe)
+    found.say(
+        "labels",
+        Level.FACT,
+        f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel, on {100 * share:.0f} % of "
+        f"what both images show: some {100 * expected:.0f} % of the pixels that neither image "
+        f"hides will have a label (project.recipe: {recipe}), "
+        f"in {_tiles_in_words(nodes, covered, expected, settings)}",
+    )
+    _say_holes(nodes, density > 0, (lon, lat), found)
+    _hold_against_tiles(nodes, covered, per_px, settings, found)
+    return share
+
+
+def _say_holes(
+    nodes: Nodes, covered: Bools, ground: tuple[NDArray, NDArray], found: Findings
+) -> None:
+    """Name the ground that both images show and that lies in no file's bounds, with its area."""
+    empty = nodes.seen & ~covered
+    area = empty.sum() * nodes.step**2 * pixel_m2(nodes.model)
+    if area < SMALL_HOLE_M2 and empty.sum() < SMALL_HOLE * nodes.seen.sum():
+        return
+    _, group, sizes, _ = cv2.connectedComponentsWithStats(empty.astype(np.uint8), connectivity=4)
+    largest = group == 1 + int(np.argmax(sizes[1:, cv2.CC_STAT_AREA]))
+    lon, lat = (float(values[largest].mean()) for values in ground)
+    found.say(
+        "LiDAR",
+        Level.FACT,
+        f"{area / 1e6:.3f} km² of what both images show lie in no file's bounds and get no label, "
+        f"most of it around longitude {lon:.5f}, latitude {lat:.5f}",
+    )
+
+
+def _tiles_in_words(nodes: Nodes, covered: Bools, expected: float, settings: Configuration) -> str:
+    """About how many tiles there will be, by the best position of their grid, as export has it."""
+    size, needed = settings.tiles.size, settings.tiles.min_labelled
+    stride = settings.tiles.stride or size
+    step = cell_step(size, stride)
+    whole = nodes.windows_at(nodes.seen, size, step)
+    if not whole.size:
+        return "no tile"
+    labelled = expected * nodes.windows_at(covered, size, step)
+    enough = (whole > 1 - 1e-9) & (labelled >= needed)
+    every, jump = stride // step, max(size // step // 8, 1)
+    counts = [
+        int(enough[row::every, col::every].sum())
+        for row in range(0, min(every, enough.shape[0]), jump)
+        for col in range(0, min(every, enough.shape[1]), jump)
+    ]
+    return f"about {in_number(max(counts), 'tile')} of {size} px"
+
+
+def _hold_against_tiles(
+    nodes: Nodes, covered: Bools, per_px: float, settings: Configuration, found: Findings
+) -> None:
+    """Doubt or refuse settings by which even the best tile has too few labels."""
+    size, needed, recipe = settings.tiles.size, settings.tiles.min_labelled, settings.project.recipe
+    means = nodes.windows(covered, size)
+    whole = nodes.windows(nodes.seen, size) > 1 - 1e-9 if means.size else means.astype(bool)
+    if not whole.any():  # said by check_frame
+        return
+    best = float(means[whole].max())
+    expected = best * expected_share(per_px, recipe)
+    if expected >= needed:
+        return
+    remedy = f"set tiles.min_labelled below {expected:.2g}, or give more LiDAR"
+    by_surface = best * expected_share(per_px, "surface")
+    if recipe != "surface" and by_surface >= needed:
+        remedy = f"set project.recipe to surface ({by_surface:.0%}), or {remedy}"
+    dense = best * expected_share(BOX_SLACK * per_px, recipe)
+    found.say(
+        "labels",
+        Level.DOUBT if dense >= needed else Level.ERROR,
+        f"some {expected:.0%} of the best tile's pixels will have a label (LiDAR on {best:.0%} of "
+        f"it), tiles.min_labelled asks for {needed:.0%}",
+        remedy,
+    )

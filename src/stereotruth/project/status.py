@@ -1,0 +1,221 @@
+"""What is made of each city, and what a run would make and why: asked of Snakemake's own plan."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import logging
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from ..core.errors import InputError
+from ..evaluate.report.index_page import PAGES
+from ..tiles.manifest import read_manifest
+from .project import configured, read_scenes, require_scenes, sheet
+from .run_workflow import arguments_for
+
+FOLLOWS = "Input files updated by another job"  # of a job that runs because another does
+LONGEST = 300  # characters of a reason
+# How Snakemake says that params differ, and what stands in these; ``code``, ``script`` and
+# ``sources`` are digests (workflow/rules/sources.smk).
+PARAMS = re.compile(r"Params have changed .*?before: (.*) now: (.*)")
+DIGEST = re.compile(r"'[0-9a-f]{12,16}'")
+
+
+@dataclass(frozen=True)
+class PlannedJob:
+    """A job that a run would do."""
+
+    rule: str
+    city: str
+    of: str
+    reason: str
+
+    @property
+    def causes(self) -> list[str]:
+        """Why it runs, other than that a job before it does."""
+        parts = re.split(r"; (?=[A-Z])", self.reason)
+        return [part for part in parts if part and not part.startswith(FOLLOWS)]
+
+
+@contextlib.contextmanager
+def _heard(name: str, kept: list[logging.LogRecord]) -> Iterator[None]:
+    class Listener(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            kept.append(record)
+
+    logger, listener = logging.getLogger(name), Listener()
+    logger.addHandler(listener)
+    try:
+        yield
+    finally:
+        logger.removeHandler(listener)
+
+
+def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> list[PlannedJob]:
+    """The jobs that a run of the targets would do. Raises InputError if there is no plan."""
+    from snakemake.cli import main
+
+    given = [*targets, "--dry-run", "--cores", "1"]
+    if configfiles:
+        given += ["--configfile", *map(str, configfiles)]
+    said, records = io.StringIO(), []
+    status: object = 0
+    with (
+        _heard("snakemake", records),
+        contextlib.redirect_stdout(said),
+        contextlib.redirect_stderr(said),
+    ):
+        try:
+            main(arguments_for(given))
+        except SystemExit as end:
+            status = end.code
+    if status:
+        lines = [line for line in said.getvalue().splitlines() if line.strip()]
+        raise InputError(
+            f"there is no plan: {' '.join(lines[-4:])}",
+            remedy="correct what it names; stereotruth check says more",
+        )
+    jobs = []
+    for record in records:
+        if str(getattr(record, "event", "")).endswith("job_info"):
+            wildcards = dict(record.wildcards or {})
+            of = "/".join(wildcards.get(name, "") for name in ("scene", "lidar", "tile")).strip("/")
+            city = wildcards.get("city", "")
+            jobs.append(PlannedJob(record.rule_name, city, of, record.reason))
+    return jobs
+
+
+@dataclass(frozen=True)
+class CityStatus:
+    """A city's tiles and pages, and what a run of its tiles would do."""
+
+    city: str
+    made: str
+    pages: tuple[str, ...]
+    jobs: tuple[PlannedJob, ...]
+
+    @property
+    def state(self) -> str:
+        """In a few words."""
+        if not self.jobs:
+            return "up to date"
+        return "out of date" if self.made else "not made"
+
+    def why(self) -> list[str]:
+        """What a run would do, and the causes of it, the most frequent first."""
+        if not self.jobs:
+            return []
+        rules = Counter(job.rule for job in self.jobs)
+        lines = [", ".join(f"{rule} {count}" for rule, count in rules.items())]
+        causes: dict[str, list[str]] = {}
+        for job in self.jobs:
+            for cause in job.causes:
+                if self.made or not cause.startswith("Missing output files"):
+                    causes.setdefault(_short(cause), []).append(f"{job.rule} {job.of}".strip())
+        for cause, of in causes.items():
+            more = f" and {len(of) - 2} more" if len(of) > 2 else ""
+            lines.append(f"{', '.join(of[:2])}{more}: {cause}")
+        return lines
+
+
+def _short(reason: str) -> str:
+    """Which params differ, where Snakemake says that some do: it gives all of their values."""
+    text = " ".join(reason.split())
+    if params := PARAMS.match(text):
+        with contextlib.suppress(ValueError, SyntaxError):  # values that cannot be read back
+            text = _changes(*(dict(_flat(ast.literal_eval(f"[{p}]"))) for p in params.groups()))
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"
+
+
+def _flat(params: Iterable[object]) -> Iterator[tuple[str, str]]:
+    """Values by their names in dictionaries, at any depth; digests and others by what they are."""
+    for value in params:
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                if isinstance(inner, dict):
+                    yield from _flat([inner])
+                else:
+                    yield str(name), repr(inner)
+        elif DIGEST.fullmatch(repr(value)):
+            yield "code", repr(value)
+        else:
+            yield "", repr(value)
+
+
+def _changes(old: Mapping[str, str], new: Mapping[str, str]) -> str:
+    said = []
+    for name in sorted(name for name in {**old, **new} if old.get(name) != new.get(name)):
+        values = f"{old.get(name, 'nothing')} -> {new.get(name, 'nothing')}"
+        said.append(name if DIGEST.search(values) else f"{name} {values}".strip())
+    return f"changed: {', '.join(said)}"
+
+
+def _made(city: str) -> str:
+    """How many tiles a city has, by its manifest; empty if it has none."""
+    folder = Path("tiles", city)
+    if not (folder / "manifest.csv").is_file():
+        return ""
+    rows = read_manifest(folder)
+    splits = Counter(row.get("split", "") for row in rows if row.get("complete") == "yes")
+    incomplete = len(rows) - splits.total()
+    counts = [f"{count} {split or 'without a split'}" for split, count in splits.items()]
+    counts += [f"{incomplete} without complete labels"] * (incomplete > 0)
+    return f"{len(rows)} tiles ({', '.join(counts)})"
+
+
+def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list[CityStatus]:
+    """The status of cities, all of the sheet if none is named. Raises InputError for others."""
+    require_scenes(configfiles)
+    settings, _ = configured(configfiles)
+    known, scenes = read_scenes(settings)
+    with_scenes = [city for city in known if any(s.city == city for s in scenes.values())]
+    if unknown := [city for city in cities if city not in known]:
+        raise InputError(
+            f"no city {unknown[0]!r}",
+            file=sheet(settings, "cities"),
+            remedy=f"take one of {', '.join(known)}",
+        )
+    wanted = list(cities) or with_scenes
+    if not wanted:
+        raise InputError(
+            "no scene in it",
+            file=sheet(settings, "scenes"),
+            remedy="stereotruth scene add DELIVERY --lidar FOLDER",
+        )
+    jobs = plan([f"tiles/{city}" for city in wanted], configfiles)
+    pages = [page for pattern in PAGES for page in Path().glob(pattern)]
+    return [
+        CityStatus(
+            city,
+            _made(city),
+            tuple(str(page) for page in pages if city in page.parts),
+            tuple(job for job in jobs if job.city == city),
+        )
+        for city in wanted
+    ]
+
+
+def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> None:
+    """Print a table of the cities."""
+    every = status_of(cities, configfiles)
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(width=160, highlight=False)
+    table = Table(box=None, pad_edge=False, show_edge=False, header_style="bold")
+    for heading in ("city", "tiles", "made", "page", "a run would do, and why"):
+        table.add_column(heading, overflow="fold")
+    for city in every:
+        style = "green" if city.state == "up to date" else "yellow"
+        page = ", ".join(city.pages) or "none"
+        row = (city.city, f"[{style}]{city.state}[/{style}]", city.made or "none", page)
+        table.add_row(*row, "\n".join(map(escape, city.why())))
+    console.print(table)

@@ -1,0 +1,371 @@
+"""One tile: its pixels, its files, its row of the manifest."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.config.labels import Limits
+from ..core.errors import InputError
+from ..core.numerics.degrees import turn
+from ..core.products.files import link
+from ..core.products.finished_pieces import Ledger
+from ..core.products.provenance import digest, file_sha256
+from ..core.products.rasters import write_tiff
+from ..epipolar.warping import agreement, warp_rows
+from .label_surfaces import label_surfaces
+from .layer_kinds import column
+from .orientation import orientation, save
+from .scene_stores import SceneStores
+from .sift_matches import match_tile
+from .split_names import NONE
+from .tile_checks import TileChecks, check_cells, count_sigma
+from .tile_classes import Buildings
+from .tile_layers import tile_layers, write_layer
+from .windows import Window
+
+FILES = ("left", "right", "disp", "status", "orientation")
+RIGHT_FILES = ("disp_right", "status_right")  # labels of the right view, where a scene has them
+
+
+STEPS = 1024  # in a px, of disparities in 32 bits: they compress to little more than half
+
+
+def round_disparity(disparity: NDArray[np.floating], dtype: str) -> NDArray[np.float32]:
+    """Disparities as stored, in float32, rounded to nearest: of 1/1024 px, or of float16."""
+    if dtype == "float16":
+        return disparity.astype(np.float16).astype(np.float32)
+    return (np.rint(disparity * STEPS) / STEPS).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """How the tiles of a city are cut and written."""
+
+    city: str
+    prefix: str
+    size: int
+    dtype: str
+    nodata: float
+    building_share: float
+    limits: Limits
+    code: str
+    flags: Mapping[int, str]  # meaning of the status values of all scenes
+    layers: tuple[str, ...]  # see tile_layers
+    work: Path  # where the files of finished tiles wait, with the ledger
+    provenance: Mapping[str, Any]
+
+    @property
+    def ledger(self) -> Ledger:
+        """Records of the tiles whose files are there."""
+        return Ledger(self.work / "done")
+
+
+@dataclass(frozen=True, eq=False)
+class _Crop:
+    """The pixels of a tile, and what they are called."""
+
+    left: NDArray[np.uint16]
+    right: NDArray[np.uint16]
+    disparity: NDArray[np.float64]  # of the pair, NaN where there is none
+    stored: NDArray[np.float32]  # the same as the file has it
+    status: NDArray[np.uint8]
+    of_right: NDArray[np.float32] | None
+    status_of_right: NDArray[np.uint8] | None
+    colour_left: NDArray[np.uint16] | None  # [3, h, w]
+    colour_right: NDArray[np.uint16] | None
+
+    @classmethod
+    def of(cls, source: SceneStores, window: Window, cut: Cut) -> _Crop:
+        rows, start = slice(window.row0, window.row0 + cut.size), window.col0 - window.offset
+        here = (rows, slice(window.col0, window.col0 + cut.size))
+        there = (rows, slice(start, start + cut.size))
+        disparity = source.disparity[here].astype(np.float64) - window.offset
+        of_right = status_of_right = None
+        if window.labelled and source.of_right is not None:
+            values = source.of_right["disparity"][there].astype(np.float64) - window.offset
+            of_right = round_disparity(values, cut.dtype)
+            status_of_right = source.of_right["status"][there]
+        colours = (None, None)
+        if source.colours is not None:
+            colours = (
+                np.stack([band[part] for band in bands])
+                for bands, part in zip(source.colours, (here, there))
+            )
+        return cls(
+            left=source.left[here],
+            right=source.right[there],
+            disparity=disparity,
+            stored=round_disparity(disparity, cut.dtype),
+            status=source.status[here],
+            of_right=of_right,
+            status_of_right=status_of_right,
+            **dict(zip(("colour_left", "colour_right"), colours)),
+        )
+
+    def arrays(self) -> list[NDArray[Any]]:
+        """All that the tile's files but the orientation follow from."""
+        found = (getattr(self, f.name) for f in fields(self))
+        return [np.ascontiguousarray(array) for array in found if array is not None]
+
+
+def tile_names(
+    source: SceneStores, window: Window, number: int, prefix: str, layers: Sequence[str] = ()
+) -> dict[str, str]:
+    """Paths of a tile's files in the city's folder, by kind."""
+    group = "" if window.labelled else "unlabelled/"
+    names = {
+        "left": f"{group}left/{prefix}_left_{number}.tiff",
+        "right": f"{group}right/{prefix}_right_{number}.tiff",
+        "orientation": f"orientation/{prefix}_{number}.json",
+    }
+    if window.labelled:
+        names["disp"] = f"disp/{prefix}_disparity_{number}.tiff"
+        names["status"] = f"status/{prefix}_status_{number}.tiff"
+        if source.of_right is not None:
+            names["disp_right"] = f"disp_right/{prefix}_disparity_right_{number}.tiff"
+            names["status_right"] = f"status_right/{prefix}_status_right_{number}.tiff"
+        names |= {column(layer): f"{layer}/{prefix}_{layer}_{number}.tiff" for layer in layers}
+    return names
+
+
+def _write_images(
+    paths: Mapping[str, Path], source: SceneStores, window: Window, crop: _Crop, cut: Cut
+) -> None:
+    """Write a tile's TIFF files."""
+    for path in paths.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    for view in ("left", "right"):
+        grey, colour = getattr(crop, view), getattr(crop, f"colour_{view}")
+        write_tiff(paths[view], grey if colour is None else colour, nodata=0)
+    if not window.labelled:
+        return
+    meanings = ", ".join(f"{value} {meaning}" for value, meaning in source.flags.items())
+    options = {"nodata": cut.nodata, "half": cut.dtype == "float16"}
+    known = np.isfinite(crop.disparity)
+    _write_labels(paths["disp"], np.where(known, crop.stored, np.nan), **options)
+    write_tiff(paths["status"], crop.status, description=meanings)
+    if crop.of_right is not None and crop.status_of_right is not None:
+        _write_labels(paths["disp_right"], crop.of_right, **options)
+        write_tiff(paths["status_right"], crop.status_of_right, description=meanings)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelsKnown:
+    """What is known of a tile's labels beside their values: uint8[h, w], and px, float64[h, w].
+
+    ``kind``: class of the tile; ``surface``: see :class:`.label_surfaces.LabelSurface`; ``sigma``:
+    their uncertainty, 0 where a store does not tell.
+    """
+
+    kind: str
+    surface_class: NDArray[np.uint8]
+    surface: NDArray[np.uint8]
+    sigma: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        source: SceneStores,
+        here: tuple[slice, slice],
+        disparity: NDArray[np.float64],
+        building_share: float,
+    ) -> LabelsKnown:
+        """Of the tile at those rows and columns."""
+        surface_class = np.zeros(disparity.shape, np.uint8)
+        if source.surface_class is not None:
+            surface_class = np.asarray(source.surface_class[here])
+        sigma = np.zeros(disparity.shape)
+        if source.uncertainty is not None:
+            sigma = np.nan_to_num(np.asarray(source.uncertainty[here], np.float64))
+        buildings = Buildings.of_tile(surface_class, source.height, here)
+        return cls(
+            kind=buildings.tile_class(building_share),
+            surface_class=surface_class,
+            surface=label_surfaces(disparity, sigma, surface_class, buildings.found),
+            sigma=sigma,
+        )
+
+    def arrays(self) -> list[NDArray[Any]]:
+        """All that the checks of a tile follow from, beside its pixels."""
+        return [self.surface_class, self.surface, self.sigma]
+
+
+def _finished(
+    source: SceneStores, window: Window, names: Mapping[str, str], crop: _Crop, cut: Cut
+) -> tuple[dict[str, str], TileChecks | None]:
+    """Write a tile's TIFF files and check it, or take it over; their checksums, and the checks.
+
+    A tile is taken over if its pixels, what its checks need, names, settings and code are the same.
+    """
+    here = (
+        slice(window.row0, window.row0 + cut.size),
+        slice(window.col0, window.col0 + cut.size),
+    )
+    known = None
+    if window.labelled:
+        known = LabelsKnown.of(source, here, crop.disparity, cut.building_share)
+    layers = tile_layers(source, here, cut.layers) if window.labelled else {}
+    pixels = hashlib.sha256()
+    for array in (*crop.arrays(), *(known.arrays() if known else ()), *layers.values()):
+        pixels.update(array)
+    files = {name: path for name, path in names.items() if name != "orientation"}
+    paths = {name: cut.work / path for name, path in files.items()}
+    made_of = {
+        "pixels": pixels.hexdigest(),
+        "files": files,
+        "flags": [[int(value), meaning] for value, meaning in source.flags.items()],
+        "settings": [cut.dtype, cut.nodata, known.kind if known else ""],
+        "code": cut.code,
+    }
+    key, tile = digest(made_of), f"{cut.prefix}_{names['left'].rpartition('_')[2][:-5]}"
+    piece = cut.ledger.find(tile, key, paths)
+    if piece is None:
+        _write_images(paths, source, window, crop, cut)
+        for name, values in layers.items():
+            write_layer(paths[column(name)], name, values)
+        checks = None if known is None else _check(crop, known)
+        piece = cut.ledger.put(tile, key, paths, None if checks is None else checks.to_dict())
+    found = piece.result
+    return dict(piece.sha256), None if found is None else TileChecks.from_dict(found)
+
+
+def write_tile(
+    folder: Path, source: SceneStores, window: Window, number: int, cut: Cut
+) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
+    """Put a tile into ``folder``: manifest row (without split), ring on the ground, checks."""
+    name = f"{cut.prefix}_{number}"
+    crop = _Crop.of(source, window, cut)
+    known, disparity = np.isfinite(crop.disparity), crop.disparity
+    if any((v == cut.nodata).any() for v in (crop.stored, crop.of_right) if v is not None):
+        raise InputError(
+            f"tile {name} has a true disparity of {cut.nodata:g} px, the value for nodata",
+            remedy="set tiles.nodata to a value that no disparity takes",
+        )
+    files = tile_names(source, window, number, cut.prefix, cut.layers)
+    sums, checks = _finished(source, window, files, crop, cut)
+    for kind in sums:
+        link(cut.work / files[kind], folder / files[kind])
+    height = source.height[
+        window.row0 : window.row0 + cut.size, window.col0 : window.col0 + cut.size
+    ]
+    record = orientation(
+        source.model,
+        source.sensors,
+        row0=window.row0,
+        col0=window.col0,
+        size=cut.size,
+        offset=window.offset,
+        height=height,
+        disparity=np.where(known, crop.stored, np.nan),
+    )
+    head = {"tile": name, "city": cut.city, "scene": source.scene, "files": files}
+    if source.lidar and (frame := source.lidar.get("frame")):
+        head["ground_frame"] = frame
+    save(folder / files["orientation"], head | record | {"provenance": cut.provenance})
+    sums["orientation"] = file_sha256(folder / files["orientation"])
+
+    ring = np.array(record["footprint"]["coordinates"][0][:-1])
+    match = np.arange(cut.size) - disparity
+    inside = (match >= -0.5) & (match <= cut.size - 0.5)
+    values = crop.stored[known].astype(np.float64)
+    lon, lat = ring.mean(axis=0)
+    row = {
+        "tile": name,
+        "number": number,
+        "city": cut.city,
+        "scene": source.scene,
+        "row0": window.row0,
+        "col0": window.col0,
+        "size": cut.size,
+        "right_offset_px": window.offset,
+        "complete": "yes" if window.labelled else "no",
+        "split": NONE,
+        "labelled_share": f"{known.mean():.6f}",
+        "matched_share": f"{inside.sum() / max(known.sum(), 1):.6f}",
+        "disparity_min_px": f"{values.min():.4f}" if values.size else "",
+        "disparity_mean_px": f"{values.mean():.4f}" if values.size else "",
+        "disparity_max_px": f"{values.max():.4f}" if values.size else "",
+        "disparity_rounding_px": (
+            f"{np.abs(values - disparity[known]).max():.6f}" if values.size else ""
+        ),
+        "disparity_nodata": f"{cut.nodata:g}",
+        "lon": f"{turn(lon):.7f}",
+        "lat": f"{lat:.7f}",
+        **_lidar_days(source, window, known),
+        **_light(source),
+        **check_cells(checks, cut.limits),
+    }
+    for value, meaning in cut.flags.items():
+        row[f"count_{meaning}"] = int((crop.status == value).sum())
+    for kind in (
+        *FILES,
+        *(RIGHT_FILES if source.of_right is not None else ()),
+        *map(column, cut.layers),
+    ):
+        row[kind] = files.get(kind, "")
+        row[f"{kind}_sha256"] = sums.get(kind, "")
+    return row, ring, checks
+
+
+def _lidar_days(
+    source: SceneStores, window: Window, known: NDArray[np.bool_]
+) -> dict[str, int | str]:
+    """Days from the LiDAR to both images: of a pair's labels (``known``), the median of those whose
+    day is known; empty where no such day, or none of the image, is."""
+    days = np.empty(0, np.uint16)
+    if source.lidar_date is not None:
+        rows, cols = known.shape
+        here = slice(window.row0, window.row0 + rows), slice(window.col0, window.col0 + cols)
+        days = np.asarray(source.lidar_date[here])[known]
+        days = np.sort(days[days > 0])
+    found: dict[str, int | str] = {}
+    for view, taken in zip(("left", "right"), source.acquired):
+        cell = f"lidar_days_{view}"
+        found[cell] = ""
+        if taken and days.size:
+            since_1970 = int(np.datetime64(taken, "D").astype(np.int64))
+            found[cell] = since_1970 - int(days[days.size // 2])
+    return found
+
+
+def _light(source: SceneStores) -> dict[str, str]:
+    """Whether the images share no light, and what decided that; empty where nothing says it."""
+    if source.light is None:
+        return {"diachronic": "", "diachronic_by": ""}
+    told = "yes" if source.light["diachronic"] else "no"
+    return {"diachronic": told, "diachronic_by": source.light["decided_by"]}
+
+
+def _write_labels(path: Path, disparity: NDArray[np.float32], *, nodata: float, half: bool) -> None:
+    """Disparities (px, NaN where there is none) as a TIFF."""
+    write_tiff(
+        path,
+        np.where(np.isfinite(disparity), disparity, np.float32(nodata)),
+        nodata=nodata,
+        half=half,
+        description="disparity in px, x_left - x_right of this pair",
+    )
+
+
+def _check(crop: _Crop, known: LabelsKnown) -> TileChecks:
+    """Hold the labels of a tile, as stored, against its images."""
+    left, right = crop.left, crop.right
+    disparity = np.where(np.isfinite(crop.disparity), crop.stored.astype(np.float64), np.nan)
+    x = np.arange(left.shape[1])[None, :] - disparity
+    matches = match_tile(left, right, disparity, known.surface_class)
+    labelled = np.isfinite(disparity)
+    return TileChecks(
+        kind=known.kind,
+        matches=matches,
+        warping=agreement(left.astype(np.float64), warp_rows(right.astype(np.float64), x)),
+        surface=known.surface[matches.pixel],
+        sigma=known.sigma[matches.pixel],
+        stated=count_sigma(known.sigma[labelled], known.surface[labelled]),
+    )

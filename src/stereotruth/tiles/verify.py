@@ -1,0 +1,116 @@
+"""Holding a folder of tiles, or the dataset, against the checksums of its manifest."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from fnmatch import fnmatch
+from pathlib import Path
+
+from ..core.errors import InputError
+from ..core.products.files import read_json
+from ..core.products.folders import is_foreign
+from ..core.products.provenance import file_sha256, own_digest
+from .footprints import FOOTPRINTS, STYLE
+from .manifest import read_manifest
+from .quick_looks import STATUS_COLOURS_FILE
+
+log = logging.getLogger("stereotruth")
+
+
+# files that the manifest does not list; STYLE is the user's to change
+LOOSE = (
+    *("manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE, STATUS_COLOURS_FILE),
+    *("croissant.json", "stac/collection.json", "stac/rpc/*"),
+)
+
+
+def defects(folder: str | Path) -> list[str]:
+    """What differs from the manifest: ``missing``, ``changed`` or ``not in the manifest`` files.
+
+    ``export.json`` keeps its own digest, and those of the manifest and the footprints. Works on
+    ``tiles/<City>`` and on ``dataset``. Files of other programs (:func:`foreign_files`) are no
+    defects. Raises InputError if there is no manifest.
+    """
+    folder = Path(folder)
+    found = []
+    listed = set()
+    for row in read_manifest(folder):
+        for kind in (key.removesuffix("_sha256") for key in row if key.endswith("_sha256")):
+            if not (name := row[kind]):
+                continue
+            listed.add(name)
+            if not (folder / name).is_file():
+                found.append(f"{name}: missing")
+            elif file_sha256(folder / name) != row[f"{kind}_sha256"]:
+                found.append(f"{name}: changed")
+    files = (p for p in folder.rglob("*") if p.is_file())
+    # a workflow manager may leave a hidden time stamp of its own
+    present = {
+        p.relative_to(folder).as_posix()
+        for p in files
+        if not p.name.startswith(".") and not _is_foreign(p)
+    }
+    found += [
+        f"{name}: not in the manifest" for name in sorted(present - listed) if not _is_loose(name)
+    ]
+    if (record := folder / "export.json").is_file():
+        try:
+            said = read_json(record)
+        except InputError:
+            said = {}
+        if said.get("digest") != own_digest(said):
+            found.append("export.json: changed")
+        for name, key in (("manifest.csv", "manifest_sha256"), (FOOTPRINTS, "footprints_sha256")):
+            if not (folder / name).is_file():
+                found.append(f"{name}: missing")
+            elif file_sha256(folder / name) != said.get(key):
+                found.append(f"{name}: changed")
+    return found
+
+
+def _is_loose(name: str) -> bool:
+    return any(fnmatch(name, pattern) for pattern in LOOSE)
+
+
+def _is_foreign(path: Path) -> bool:
+    return path.name != STYLE and is_foreign(path.name)
+
+
+def foreign_files(folder: str | Path) -> list[str]:
+    """Files that other programs have left in a folder of tiles, as paths in it, sorted."""
+    folder = Path(folder)
+    files = (p for p in folder.rglob("*") if p.is_file() and _is_foreign(p))
+    return sorted(p.relative_to(folder).as_posix() for p in files)
+
+
+def verify(folders: Iterable[str | Path]) -> dict[str, int]:
+    """Check folders; the number of files that the manifest of each lists.
+
+    Files of other programs are named in the log and left alone. Raises InputError, after all were
+    looked at, naming the files that do not agree.
+    """
+    counts, bad = {}, []
+    for folder in map(Path, folders):
+        found = defects(folder)
+        bad += [f"{folder}/{line}" for line in found]
+        for line in found:
+            log.error("%s/%s", folder, line)
+        rows = read_manifest(folder)
+        files = [1 for row in rows for key in row if key.endswith("_sha256") and row[key]]
+        counts[str(folder)] = len(files)
+        if foreign := foreign_files(folder):
+            more = f" and {len(foreign) - 5} more" if len(foreign) > 5 else ""
+            log.info(
+                "%s: files of other programs, left alone: %s%s",
+                *(folder, ", ".join(foreign[:5]), more),
+            )
+        if not found:
+            log.info("%s: %d files as in the manifest", folder, len(files))
+    if bad:
+        more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
+        raise InputError(
+            f"{len(bad)} files differ from the manifests: {'; '.join(bad[:5])}{more}",
+            remedy="delete the folder and make it again with snakemake",
+        )
+    return counts

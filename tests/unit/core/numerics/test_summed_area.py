@@ -1,0 +1,28 @@
+"""Sums over windows against sums that are taken one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereotruth.core.numerics.summed_area import summed_area, window_sums
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+@pytest.mark.parametrize("kind", [bool, np.int32, float])
+def test_sums_of_windows(size, kind):
+    values = (np.random.default_rng(2).uniform(0, 3, (6, 9))).astype(kind)
+    found = window_sums(values, size)
+    assert found.shape == (7 - size, 10 - size)
+    for (row, col), total in np.ndenumerate(found):
+        assert total == pytest.approx(values[row : row + size, col : col + size].sum(), rel=1e-12)
+
+
+def test_whole_numbers_are_summed_exactly_beyond_their_type():
+    values = np.full((400, 300), 255, np.uint8)
+    assert summed_area(values)[-1, -1] == 255 * 400 * 300
+
+
+def test_a_window_larger_than_the_grid_is_nowhere():
+    assert window_sums(np.ones((3, 5)), 4).shape == (0, 2)
+    assert window_sums(np.ones((3, 5)), 9).size == 0

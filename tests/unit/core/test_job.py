@@ -1,0 +1,128 @@
+"""What a job says when it fails."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from stereotruth.core.errors import InputError
+from stereotruth.core.job import in_own_process, job
+
+
+def test_input_errors_are_one_line_in_any_alphabet(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("LC_ALL", "C")
+    log = tmp_path / "a.log"
+    with pytest.raises(SystemExit), job(log, "ingest ö"):
+        raise InputError("5° − 3 × 2", file="ü.laz", remedy="→ другой")
+    assert "ERROR ingest ö: error: ü.laz: 5° − 3 × 2. Remedy: → другой" in log.read_text("utf-8")
+
+
+def test_panics_of_libraries_are_logged(tmp_path) -> None:
+    """Those of Rust are no Exception; the log was empty."""
+    panic = type("PanicException", (BaseException,), {})
+    with pytest.raises(panic), job(tmp_path / "a.log", "ingest"):
+        raise panic("index out of bounds")
+    text = (tmp_path / "a.log").read_text("utf-8")
+    assert "unexpected failure" in text
+    assert "index out of bounds" in text
+
+
+def test_a_file_that_is_taken_away_is_one_sentence(tmp_path, capsys) -> None:
+    log = tmp_path / "a.log"
+    with pytest.raises(SystemExit), job(log, "refine"):
+        (tmp_path / "left.zarr").read_bytes()
+    line = f"refine: error: {tmp_path / 'left.zarr'}: no such file: it was there"
+    assert line in capsys.readouterr().err.splitlines()[0]
+    text = log.read_text("utf-8")
+    assert f"ERROR {line}" in text and "Traceback" in text  # for whoever looks for a defect
+
+
+def test_secrets_of_urls_are_not_logged(tmp_path, capsys) -> None:
+    log = tmp_path / "a.log"
+    with pytest.raises(RuntimeError), job(log, "ingest") as lines:
+        lines.info("reads https://me:hunter2@host/a")
+        raise RuntimeError("https://host/a?X-Amz-Signature=hunter2")
+    said = capsys.readouterr().err
+    assert "hunter2" not in log.read_text("utf-8") + said and said.count("host/a") >= 2
+
+
+def test_freed_memory_is_used_again(tmp_path) -> None:
+    """What follows a block of 64 MiB (16384 pages) costs no page of the system's within a job."""
+    if not hasattr(ctypes.CDLL(None), "mallopt"):
+        pytest.skip("another C library than glibc")
+    lines = (
+        "import ctypes, resource, sys",
+        "from stereotruth.core.job import job",
+        "c, size = ctypes.CDLL(None), ctypes.c_size_t(64 << 20)",
+        "c.malloc.restype = ctypes.c_void_p",
+        "def faults():",
+        "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt",
+        "    block = ctypes.c_void_p(c.malloc(size))",
+        "    c.memset(block, 1, size)",
+        "    c.free(block)",
+        "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before",
+        "usual = [faults() for _ in range(3)]",
+        "with job(sys.argv[1], 'a'):",
+        "    faults()",
+        "    print(*usual, faults())",
+    )
+    call = [sys.executable, "-c", "\n".join(lines), str(tmp_path / "a.log")]
+    *usual, kept = map(int, subprocess.run(call, capture_output=True, check=True).stdout.split())
+    assert kept < min(usual) / 10
+
+
+def test_an_interrupt_is_no_failure(tmp_path) -> None:
+    with pytest.raises(KeyboardInterrupt), job(tmp_path / "a.log", "ingest"):
+        raise KeyboardInterrupt
+    assert (tmp_path / "a.log").read_text("utf-8") == ""
+
+
+def test_work_in_a_process_of_its_own_returns_and_raises(tmp_path) -> None:
+    assert in_own_process(lambda: {"a": [1]}, "a.laz") == {"a": [1]}
+
+    def refuse():
+        raise InputError("is wrong", file="b.laz", remedy="mend it")
+
+    with pytest.raises(InputError, match=r"b.laz: is wrong. Remedy: mend it"):
+        in_own_process(refuse, "a.laz")
+    with pytest.raises(OSError, match="full") as error:
+        in_own_process(lambda: os.write(3, (_ for _ in ()).throw(OSError(28, "full"))), "a.laz")
+    assert error.value.errno == 28
+    assert "Traceback" in error.value.__notes__[0]
+
+
+def test_a_crash_of_that_process_is_a_refusal() -> None:
+    """Some damaged LAZ files crash lazrs."""
+    with pytest.raises(InputError, match=r"a.laz: damaged: the decoder crashed .*-9"):
+        in_own_process(lambda: os.kill(os.getpid(), signal.SIGKILL), "a.laz")
+
+
+def test_that_process_ends_with_its_parent(tmp_path) -> None:
+    """A job that was killed must not publish later."""
+    file = tmp_path / "pid"
+    script = (
+        "import os, time, pathlib; from stereotruth.core.job import in_own_process\n"
+        f"file = pathlib.Path({str(file)!r})\n"
+        "def work():\n    file.with_suffix('.new').write_text(str(os.getpid()))\n"
+        "    file.with_suffix('.new').rename(file)\n    time.sleep(100)\n"
+        "in_own_process(work, 'a.laz')"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script])
+    while not file.exists():
+        assert parent.poll() is None
+        time.sleep(0.05)
+    parent.kill()
+    parent.wait()
+    for _ in range(400):
+        state = Path(f"/proc/{file.read_text()}/stat")
+        if not state.exists() or state.read_text().split(") ")[1][0] == "Z":
+            return
+        time.sleep(0.05)
+    pytest.fail("it is still there")

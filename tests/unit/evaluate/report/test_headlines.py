@@ -1,0 +1,155 @@
+"""The figures on top of a city's page: those of the last lines of a run, and in metres."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from stereotruth.evaluate.report.headlines import headlines
+from stereotruth.tiles.summary import summary_lines
+
+SCENE = {
+    "gcp_rms_px": 0.3,
+    "sift_matches": 1315,
+    "sift_mean_error_px": 0.0274,
+    "sift_mean_absolute_error_px": 0.2416,
+    "sift_median_error_px": 0.014,
+    "y_parallax_median_px": -0.0131,
+    "y_parallax_rms_px": 0.3132,
+    "warp_correlation": 0.98283,
+    "quality": "ok",
+}
+ROW = {
+    "tile": "A_0",
+    "complete": "yes",
+    "split": "train",
+    "labelled_share": "0.829",
+    "disparity_min_px": "-5.5",
+    "disparity_max_px": "33.3",
+    # of the tile alone: another figure than the scene's
+    "sift_mean_absolute_error_px": "0.32",
+    "quality": "ok",
+}
+
+
+def cards(scenes, height=None, rows=(ROW,), truth=()):
+    found = headlines(rows, {}, {}, truth, {"quality": {"scenes": scenes}}, height)
+    return {card.title: card for card in found}
+
+
+def test_what_the_images_say_is_one_number_on_the_page_and_in_the_terminal():
+    summary = {
+        "city": "A",
+        "labelled_pairs": 1,
+        "unlabelled_pairs": 0,
+        "size_px": 256,
+        "splits": {"realised": {"train": 1}},
+        "share_of_pixels": {"labelled": 0.829, "no_points": 0.171},
+        "disparity_px": {"min": -5.5, "max": 33.3},
+        "disparity_rounding": {"largest_px": 0.0005},
+        "label_uncertainty": {},
+        "quality": {"scenes": {"A-1": SCENE}, "flagged_tiles": {}, "doubts": {}},
+    }
+    said = " ".join(summary_lines(summary, "tiles/A")).replace("-", "−")
+    found = cards({"A-1": SCENE})
+    assert found["SIFT disparity − label"].value == "0.24 px"
+    for title in ("SIFT disparity − label", "pixels labelled"):
+        assert re.search(rf"(?<![\d.]){re.escape(found[title].value)}(?!\d)", said), title
+    assert "1315 matches" in found["SIFT disparity − label"].note
+
+
+def test_several_scenes_have_their_range():
+    other = SCENE | {"sift_mean_absolute_error_px": 0.31, "sift_matches": 85}
+    card = cards({"A-1": SCENE, "A-2": other}, height=2.0)["SIFT disparity − label"]
+    assert card.value == "0.24–0.31 px"
+    assert card.note == (
+        "2 scenes; 1400 matches, mean absolute; about 0.18 px of it SIFT's own; ≤ 0.62 m of height"
+    )
+
+
+def test_metres_stand_beside_px_where_the_geometry_is_known():
+    truth = [{"scope": "tiles", "mean_absolute_px": "0.021"}]
+    found = cards({"A-1": SCENE}, height=1.03, truth=truth)
+    assert found["SIFT disparity − label"].note.endswith("0.25 m of height")
+    assert found["error against the truth"].note == "mean absolute; 0.022 m of height"
+    assert found["disparities"].note == "40 m of height"
+    assert cards({"A-1": SCENE})["disparities"].note == "of the tiles"
+
+
+def test_how_well_labels_are_known_comes_first_with_the_surfaces():
+    by = {
+        "all": {"uncertainty_median_px": 0.0412, "uncertainty_p95_px": 0.104},
+        "open_ground": {"uncertainty_median_px": 0.03, "uncertainty_p95_px": 0.05},
+    }
+    truth = [{"scope": "tiles", "mean_absolute_px": "0.021"}]
+    export = {"quality": {"scenes": {"A-1": SCENE}}, "label_uncertainty": by}
+    known, exact, *_ = headlines([ROW], {}, {}, truth, export, 1.0)
+    assert (known.title, known.value) == ("labels known to", "0.041 px")
+    assert "0.1 px for 95 %" in known.note and "open ground 0.03" in known.note
+    assert exact.value == "0.021 px"
+
+
+def test_a_missed_gate_is_among_the_first_six():
+    found = headlines(
+        [ROW | {"quality": "max_sift_error_px"}], {}, {}, [], {"quality": {"scenes": {}}}
+    )
+    assert any(card.bad for card in found[:6])
+
+
+def test_density_is_that_of_the_scenes():
+    assert "LiDAR density" not in cards({"A-1": SCENE})
+    dense, sparse = (SCENE | {"lidar_points_per_m2": value} for value in (10.84, 0.5))
+    assert cards({"A-1": dense})["LiDAR density"].value == "11 points/m²"
+    assert cards({"A-1": dense, "A-2": sparse})["LiDAR density"].value == "0.5–11 points/m²"
+
+
+LIDAR = {
+    "bytes": [1, 1],
+    "files": [1, 1],
+    "nodes": None,
+    "holes_m2": 0.0,
+    "not_read_m2": 0.0,
+    "acquired": ["2019-05-04", "2019-05-09"],
+    "surfaces": {"ellipsoid": 1},
+}
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        ("", "", ""),
+        ("12", "", "images 12 days later"),
+        ("365", "12", "images 12–365 days later"),
+        ("-7", "-7", "images 7 days earlier"),
+        ("-7", "30", "images from 7 days earlier to 30 days later"),
+    ],
+)
+def test_days_from_the_lidar_to_the_images_stand_beside_its_own(left, right, said):
+    row = ROW | {"lidar_days_left": left, "lidar_days_right": right}
+    card = cards({"A-1": SCENE | {"lidar": LIDAR}}, rows=[row, ROW])["LiDAR measured"]
+    assert (card.value, card.note) == ("2019-05-04 to 2019-05-09", said)
+
+
+def test_a_doubt_stands_with_the_gates():
+    quality = {"scenes": {"A-1": SCENE}, "doubts": {"A-1": [{"text": "images say so"}]}}
+    (gates,) = (
+        c
+        for c in headlines([ROW], {}, {}, [], {"quality": quality})
+        if c.title == "limits of quality"
+    )
+    assert gates.bad
+    assert "images and labels disagree in A-1" in gates.note
+
+
+def test_what_alignment_and_lidar_doubt_stands_there_too():
+    told = {"of": "alignment", "text": "RPCs", "explained_by_alignment": False}
+    for explained in (False, True):
+        quality = {
+            "scenes": {"A-1": SCENE},
+            "doubts": {"A-1": [told | {"explained_by_alignment": explained}]},
+        }
+        every = headlines([ROW], {}, {}, [], {"quality": quality})
+        (gates,) = (c for c in every if c.title == "limits of quality")
+        assert gates.bad != explained
+        assert ("alignment or LiDAR of A-1 in doubt" in gates.note) != explained

@@ -1,0 +1,83 @@
+"""Offsets of disparity along a scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereobench.methods.scenes.offsets import best_offset, find_offsets, reduced
+from stereobench.methods.scenes.tiling import Tiling
+from stereobench.methods.sgm import SemiGlobalMatcher
+from stereotruth.core.errors import InputError
+
+from ....synthetic.exact_method import SHAPE, Exact, coded
+from ....synthetic.images import textured
+from ....synthetic.whole_images import match
+
+
+def test_offsets_of_blocks_bring_a_large_relief_into_a_small_range():
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    truth = 0.4 * x - 0.2 * y - 30.0
+    left, right, known = coded(truth)
+    tiling = Tiling(SHAPE, 32, 8)
+    offsets = np.zeros(tiling.count, int)
+    for place in tiling.places():
+        offsets[place] = np.rint(truth[tiling.block_window(place)].mean())
+    given = {"block": 32, "overlap": 8}
+    found = match(Exact(), left, right, (-16, 16), offset=offsets, **given)
+    assert np.abs(found - truth)[known].max() < 1e-3
+    assert np.isnan(match(Exact(), left, right, (-16, 16), **given)).mean() > 0.5
+
+
+@pytest.mark.slow
+def test_offsets_are_found_from_the_images():
+    y, x = np.mgrid[:512, :1024]
+    truth = 0.2 * x - 100 + 5 * np.sin(y / 40)
+    left, right = textured(truth)
+    left[200:, 700:] = 0  # nodata
+    tiling = Tiling((512, 1024), 128, 32)
+    found = find_offsets(left, right, tiling, (-24, 40), (-150, 150))
+    assert found.in_range > 0.995
+    for place in tiling.places():
+        here = tiling.block_window(place)
+        if (left[here] != 0).all() and 100 < here[1].start < 900:
+            assert found.known[place]
+            assert abs(found.offsets[place] - truth[here].mean()) < 16
+    assert not found.known[-1, -1]
+    disparity = match(
+        SemiGlobalMatcher(), left, right, (-24, 40), block=128, overlap=32, offset="auto"
+    )
+    known = np.isfinite(disparity)
+    assert known[:, 120:].mean() > 0.9 * (left[:, 120:] != 0).mean()
+    assert np.median(np.abs(disparity - truth)[known]) < 0.1
+    assert not known[200:, 700:].any()
+
+
+def test_the_best_offset_holds_the_most_and_is_near_the_median():
+    assert best_offset(np.array([3.0, 4.0, 5.0]), (-64, 128)) == (4, 1.0)
+    ground, towers = np.full(900, 10.0), np.full(100, 130.0)
+    offset, share = best_offset(np.concatenate([ground, towers]), (-64, 128))
+    assert share == 1.0
+    assert offset == 130 - 128 + 8 + 1  # the towers in range, with the reserve
+    offset, share = best_offset(np.concatenate([ground, ground + 300]), (-64, 128))
+    assert share == 0.5
+
+
+def test_reduced_images_are_means_of_what_there_is():
+    image = np.arange(1, 31, dtype=np.uint16).reshape(5, 6)
+    image[0, 0] = 0
+    found = reduced(image, 2)
+    assert found.shape == (3, 3)
+    assert found[0, 0] == np.float32((2 + 7 + 8) / 3)
+    assert found[2, 0] == np.float32((25 + 26) / 2)
+    image[:2, :2] = (0, 0), (0, 9)
+    assert reduced(image, 2)[0, 0] == 0
+    assert np.array_equal(reduced(np.dstack([image] * 3), 1), image)
+
+
+def test_images_that_nowhere_match_are_refused():
+    rng = np.random.default_rng(3)
+    left, right = rng.integers(1, 1000, (2, 200, 300), dtype=np.uint16)
+    left[:] = 0
+    with pytest.raises(InputError, match="do not match anywhere"):
+        find_offsets(left, right, Tiling((200, 300), 128, 16), (-16, 16))

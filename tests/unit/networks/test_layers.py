@@ -1,0 +1,88 @@
+"""Cost volumes, soft-argmin and the convolutions' padding, against their definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
+from stereobench.networks import layers
+
+
+@pytest.mark.parametrize("low, high", [(-3, 4), (-12, -2), (2, 15)])
+def test_volumes_hold_what_their_definition_says(low: int, high: int) -> None:
+    rng = np.random.default_rng(1)
+    left, right = (torch.from_numpy(rng.standard_normal((2, 3, 4, 9))) for _ in range(2))
+    difference = layers.difference_volume(left, right, low, high)
+    both = layers.concatenation_volume(left, right, low, high)
+    assert difference.shape == (2, 3, high - low, 4, 9)
+    for k, d in enumerate(range(low, high)):
+        for x in range(9):
+            inside = 0 <= x - d < 9
+            match = right[..., x - d] if inside else torch.zeros(2, 3, 4)
+            own = left[..., x] if inside else torch.zeros(2, 3, 4)
+            assert torch.equal(difference[:, :, k, :, x], own - match)
+            assert torch.equal(both[:, :, k, :, x], torch.cat([own, match], 1))
+
+
+@pytest.mark.parametrize("volume", [layers.difference_volume, layers.concatenation_volume])
+def test_gradients_of_volumes_are_those_of_finite_differences(volume) -> None:
+    torch.manual_seed(2)
+    left, right = (torch.randn(1, 2, 2, 5, dtype=torch.double, requires_grad=True) for _ in "lr")
+    # gradients are added up in single precision
+    assert torch.autograd.gradcheck(
+        lambda a, b: volume(a, b, -6, 7), (left, right), eps=1e-3, atol=1e-5
+    )
+
+
+def test_soft_argmin_is_the_expectation() -> None:
+    cost = torch.tensor([0.0, np.log(3.0)]).view(1, 2, 1, 1)  # probabilities 3/4 and 1/4
+    assert layers.soft_argmin(cost, -2.0, 4.0).item() == pytest.approx(-2 + 4 * 0.25)
+    sharp = torch.full((1, 5, 1, 1), 100.0)
+    sharp[0, 3] = 0
+    assert layers.soft_argmin(sharp, -1.0).item() == pytest.approx(2)
+
+
+def test_strided_convolutions_pad_at_the_end() -> None:
+    """Keras: output pixel 0 of a 3 x 3 kernel is centred on input pixel 1, not 0, of 2 steps."""
+    convolution = layers.Conv2d(1, 1, 3, stride=2)
+    with torch.no_grad():
+        convolution.weight.zero_()
+        convolution.weight[0, 0, 1, 1] = 1
+    x = torch.arange(36.0).view(1, 1, 6, 6)
+    assert torch.equal(convolution(x), x[..., 1::2, 1::2])
+
+
+@pytest.mark.parametrize("kernel", [3, 4])
+def test_transposed_convolutions_double_each_side(kernel: int) -> None:
+    x = torch.randn(1, 2, 3, 4, 5)
+    assert layers.ConvTranspose3d(2, 1, kernel)(x).shape == (1, 1, 6, 8, 10)
+
+
+def test_ranges_must_be_multiples_of_the_scale() -> None:
+    assert layers.planes((-128, 64), 8) == (-16, 8)
+    for bad in ((-100, 64), (8, 8), (8, -8)):
+        with pytest.raises(ValueError, match="disparity range"):
+            layers.planes(bad, 16)
+    assert layers.planes((-96, 96), 16, 4) == (-6, 6)  # that of US3D, at 1/16 of the resolution
+    for bad in ((-96, 64), (-90, 102)):
+        with pytest.raises(ValueError, match="disparity range"):
+            layers.planes(bad, 16, 4)
+
+
+@pytest.mark.parametrize("planes", [4, 12])  # small, and not
+@pytest.mark.parametrize("stride", [1, 2])
+def test_small_volumes_are_convolved_like_large_ones(planes: int, stride: int) -> None:
+    torch.manual_seed(4)
+    convolution = layers.Conv3d(32, 16, stride=stride)
+    x = torch.randn(1, 32, planes, 64, 4, requires_grad=True)
+    assert layers._is_slow(x) == (planes == 4)
+    both = convolution(torch.cat([x, x]))
+    weights = torch.randn_like(both[:1])
+    inputs = (x, convolution.weight)
+    torch.testing.assert_close(convolution(x), both[:1])
+    for a, b in zip(
+        torch.autograd.grad(convolution(x), inputs, weights),
+        torch.autograd.grad(both[:1], inputs, weights),
+    ):
+        torch.testing.assert_close(a, b, atol=1e-3, rtol=1e-4)

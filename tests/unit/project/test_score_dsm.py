@@ -1,0 +1,69 @@
+"""A surface model judged by the program, against LiDAR files of a simulated town."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from stereocities.cities import lidar_files
+from stereocities.lidar import simulate_lidar_tile
+from stereotruth.core.errors import InputError
+from stereotruth.evaluate.surface_models import score
+from stereotruth.project.main import app
+from stereotruth.project.score_dsm import score_dsm
+
+from ...synthetic.analytic_town import CELL_M, Town
+from ...synthetic.exact_surface import exact_heights, write_heights
+from ...synthetic.small_cities import TOWN
+
+
+@pytest.mark.slow
+def test_a_model_is_judged_against_lidar_without_a_project(tmp_path):
+    scene = TOWN.scenes[0]
+    for name in lidar_files(TOWN, scene):
+        simulate_lidar_tile(TOWN, scene, name, tmp_path / "lidar" / name, spacing_m=0.5, seed=1)
+    heights, _, west, north = exact_heights(TOWN, scene, 0.65, east=1.3, north=-0.7)
+    model = write_heights(tmp_path / "dsm.tif", heights + 0.5, west, north, 0.65, TOWN.epsg)
+    arguments = ["score-dsm", str(model), "--lidar", str(tmp_path / "lidar")]
+    run = CliRunner().invoke(app, [*arguments, "--to", str(tmp_path / "verdict")])
+    assert run.exit_code == 0, run.output
+    assert "of its reference" in run.output and "index.html" in run.output
+    found = json.loads((tmp_path / "verdict" / "scores.json").read_text())
+    for name, planted in (("east_m", 1.3), ("north_m", -0.7), ("up_m", 0.5)):
+        assert abs(found["registration"][name] - planted) < 0.05
+    assert found["errors"]["ground, off steps"]["nmad_m"] < 0.1
+    page = (tmp_path / "verdict" / "index.html").read_text()
+    assert "Edges of roofs" in page and 'src="data:image' in page
+    assert (tmp_path / "verdict" / "errors.csv").read_text().startswith("stratum,points")
+
+
+def test_one_reference_is_needed(tmp_path):
+    with pytest.raises(InputError, match="--lidar or --reference"):
+        score_dsm(tmp_path / "dsm.tif", tmp_path / "to")
+    with pytest.raises(InputError, match="no LiDAR file"):
+        score_dsm(tmp_path / "dsm.tif", tmp_path / "to", lidar=str(tmp_path / "none"))
+    with pytest.raises(InputError, match="--epoch"):
+        score_dsm(tmp_path / "dsm.tif", tmp_path / "to", lidar="a", epoch="May")
+
+
+IN_ITRF = (-1.478, 0.322, -0.317)  # NAD83(2011) in ITRF2020 at 2020.0, by PROJ: east, north, up (m)
+
+
+@pytest.mark.parametrize(
+    ("model", "other", "option", "sign"),
+    [(6339, 32610, "reference", 1), (32610, 6339, "lidar", -1), (6339, 6339, "lidar", 0)],
+)
+def test_national_frames_are_brought_to_one(tmp_path, monkeypatch, model, other, option, sign):
+    """The same numbers in NAD83(2011) and in WGS 84 are places 1.5 m apart; zone 10N, Seattle."""
+    monkeypatch.setattr(score, "GROUPS", 2)  # of the jackknife, whose σ nobody asks for here
+    files = {}
+    for name, epsg in (("model", model), ("other", other)):
+        place = (500_000.0, 5_272_000.0, CELL_M, epsg)
+        files[name] = write_heights(tmp_path / f"{name}.tif", Town().heights(), *place)
+    given = files["other"] if option == "reference" else str(files["other"])
+    score_dsm(files["model"], tmp_path / "to", epoch="2020-01-01", **{option: given})
+    found = json.loads((tmp_path / "to" / "scores.json").read_text())["registration"]
+    for name, metres in zip(("east_m", "north_m", "up_m"), IN_ITRF):
+        assert found[name] == pytest.approx(sign * metres, abs=0.03)

@@ -1,0 +1,135 @@
+"""Ids of protocols: the same for the same, another one for whatever differs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+from stereobench.scores.compare_methods import compare
+from stereobench.scores.protocols import PROTOCOLS, Protocol, one_id, pair_sha256, protocol_of
+from stereobench.scores.published_rows import PUBLISHED, beside_published
+from stereobench.scores.score_method import score
+from stereotruth.core.config.methods import StereoDatasetEntry
+from stereotruth.core.errors import InputError
+from stereotruth.tiles.stereo_dataset import StereoDataset
+
+from ...synthetic.toy_benchmark import PLAN, rows
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+PAIRS = [("a", "1" * 64), ("b", "2" * 64)]
+WHU = PROTOCOLS["whu-2023"]
+
+
+def test_the_frozen_ones_keep_their_ids():
+    """A changed definition has to change these: then give it a name of its own."""
+    assert {name: of.identified(PAIRS)["id"] for name, of in PROTOCOLS.items()} == {
+        "whu-2023": "whu-2023-8f43ba77",
+        "us3d-track2": "us3d-track2-ba686ae3",
+        "exact-2026": "exact-2026-84f216ff",
+    }
+    allowed = get_args(get_type_hints(StereoDatasetEntry)["protocol"])
+    assert set(get_args(allowed[0])) == set(PROTOCOLS)
+    assert set(PUBLISHED) <= set(PROTOCOLS)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"disparity_range": (-128, 65)},
+        {"split": None},
+        {"thresholds_px": (3.0, 1.0)},
+        {"truth": "exact"},
+        {"grows_with_height": False},
+        {"mask": "all"},
+        {"holes": "left out"},
+        {"pooling": "mean of pairs"},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_whatever_changes_has_another_id(change):
+    assert replace(WHU, **change).identified(PAIRS)["id"] != WHU.identified(PAIRS)["id"]
+
+
+def test_pairs_are_of_the_id_and_their_order_is_not():
+    of = WHU.identified(PAIRS)
+    assert WHU.identified(PAIRS[::-1]) == of
+    for others in (PAIRS[:1], [PAIRS[0], ("b", "3" * 64)], [PAIRS[0], ("c", PAIRS[1][1])]):
+        assert WHU.identified(others)["id"] != of["id"]
+
+
+def test_a_pair_is_its_pixels(compared):
+    dataset = StereoDataset("toy", compared / "data", "whu", (-8, 8))
+    pair, other = dataset.pairs("test")[:2]
+    truth = dataset.labels(pair)
+    found = pair_sha256(pair, [truth])
+    assert pair_sha256(pair, [truth.copy()]) == found != pair_sha256(other, [truth])
+    truth[10, 10] += np.float32(0.001)
+    assert pair_sha256(pair, [truth]) != found
+
+
+def dataset_of(low, high):
+    return StereoDataset("d", "root", "whu", (low, high))
+
+
+def test_a_dataset_or_split_that_a_protocol_does_not_have_is_refused():
+    assert protocol_of("whu-2023", dataset_of(-128, 64), "test", [5]) == WHU
+    with pytest.raises(InputError, match=r"datasets.d.disparity_range is \[-64, 64\], in protocol"):
+        protocol_of("whu-2023", dataset_of(-64, 64), "test", [3])
+    with pytest.raises(InputError, match=r"benchmark.split is val, in protocol .* it is test"):
+        protocol_of("whu-2023", dataset_of(-128, 64), "val", [3])
+    with pytest.raises(InputError, match="no protocol 'kitti'"):
+        protocol_of("kitti", dataset_of(-128, 64), "test", [3])
+    own = protocol_of(None, dataset_of(-5, 5), None, [2])
+    assert own == Protocol("own", (-5, 5), None, (2.0,))
+
+
+def test_tables_show_one_id_and_refuse_two(compared, tmp_path):
+    """The second method scored with other thresholds is of another protocol."""
+    five = rows(compared / "compared/methods.csv")
+    (protocol,) = {row["protocol"] for row in five}
+    assert protocol.startswith("own-")
+    for name in ("methods", "by_city", "strata", "differences", "published"):
+        assert f"({protocol})" in (compared / f"compared/{name}.md").read_text().splitlines()[0]
+    assert protocol in (compared / "compared/index.html").read_text()
+    dataset = StereoDataset("toy", compared / "data", "whu", (-8, 8))
+    other = replace(PLAN, thresholds_px=[3, 2])
+    score(dataset, "test", "Half", compared / "match/half", tmp_path / "half", other)
+    folders = [compared / "benchmark/two", tmp_path / "half"]
+    predictions = [compared / "match/two", compared / "match/half"]
+    with pytest.raises(InputError, match=rf"several protocols .*Two: {protocol}; Half: own-"):
+        compare(dataset, "test", folders, predictions, tmp_path / "out", seed=1)
+    assert one_id([]) == ""
+
+
+def test_the_exact_truth_is_asked_for(compared, tmp_path):
+    dataset = StereoDataset("toy", compared / "data", "whu", (-64, 128))
+    with pytest.raises(InputError, match=r"KM_1 has no exact truth"):
+        score(
+            dataset,
+            "test",
+            "Two",
+            compared / "match/two",
+            tmp_path / "out",
+            replace(PLAN, protocol="exact-2026"),
+        )
+
+
+def test_published_rows_say_where_they_stand_and_what_is_not_known():
+    own = {
+        "label": "Mine",
+        "tiles": 4,
+        "protocol": {"name": "whu-2023", "id": "whu-2023-12345678"},
+        "all": {"filled_epe_px": 1.5, "filled_d1_3_px_share": 0.125, "labelled": 9},
+    }
+    table = beside_published([own])
+    assert table.rows[0]["d1_percent"] == 12.5 and table.rows[0]["source"] == "here, 4 pairs"
+    by_name = {row["method"]: row for row in table.rows}
+    assert by_name["HMSM-Net"]["epe_px"] == 1.672 and by_name["SGM"]["d1_percent"] == 50.79
+    assert by_name["TGRNet"]["epe_px"] == 1.586
+    assert all(row["source"] and row["not_known"] for row in table.rows[1:])
+    assert "whu-2023-12345678" in table.shown[0][0]
+    nothing = beside_published([own | {"protocol": {"name": "own", "id": "own-1"}}])
+    assert nothing.rows == [] and "Nothing is published" in nothing.shown[0][0]

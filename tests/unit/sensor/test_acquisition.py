@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+
+import pytest
+
+from stereotruth.sensor.acquisition import Acquisition, read_acquisition
+from stereotruth.sensor.sun import sun_over
+
+PLACE = 115.4, 30.2
+TIME = datetime(2020, 10, 25, 3, 12, 45, tzinfo=UTC)
+SUN = sun_over(TIME, *PLACE)
+IMD = """version = "28.3";
+BEGIN_GROUP = IMAGE_1
+\tfirstLineTime = 2020-10-25T03:12:45.000000Z;
+\tmeanSunAz = 161.5;
+\tmeanSunEl = 44.9;
+END_GROUP = IMAGE_1
+END;
+"""
+DIMAP = """<?xml version="1.0"?><Dimap_Document>
+<Dataset_Sources><Source_Identification><Strip_Source>
+<IMAGING_DATE>2020-10-25</IMAGING_DATE><IMAGING_TIME>03:12:45.0Z</IMAGING_TIME>
+</Strip_Source></Source_Identification></Dataset_Sources>
+<Geometric_Data><Use_Area>
+<Located_Geometric_Values><Solar_Incidences><SUN_AZIMUTH unit="deg">161.0</SUN_AZIMUTH>
+<SUN_ELEVATION unit="deg">44.5</SUN_ELEVATION></Solar_Incidences></Located_Geometric_Values>
+<Located_Geometric_Values><Solar_Incidences><SUN_AZIMUTH unit="deg">161.5</SUN_AZIMUTH>
+<SUN_ELEVATION unit="deg">44.9</SUN_ELEVATION></Solar_Incidences></Located_Geometric_Values>
+<Located_Geometric_Values><Solar_Incidences><SUN_AZIMUTH unit="deg">162.0</SUN_AZIMUTH>
+<SUN_ELEVATION unit="deg">45.3</SUN_ELEVATION></Solar_Incidences></Located_Geometric_Values>
+</Use_Area></Geometric_Data></Dimap_Document>"""
+GF = """<?xml version="1.0" encoding="utf-8"?><ProductMetaData><SatelliteID>GF7</SatelliteID>
+<CenterTime>{time}</CenterTime><SolarAzimuth>{azimuth}</SolarAzimuth>
+<SolarZenith>{zenith}</SolarZenith></ProductMetaData>"""
+STAC = {
+    "stac_version": "1.0.0",
+    "properties": {
+        "datetime": "2020-10-25T11:12:45+08:00",
+        "view:sun_azimuth": 161.5,
+        "view:sun_elevation": 44.9,
+    },
+    "assets": {"image": {"href": "./one.tif"}},
+}
+
+
+@pytest.fixture
+def image(tmp_path):
+    file = tmp_path / "one.tif"
+    file.write_bytes(b"no image")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("one.IMD", IMD),
+        ("one.imd", IMD),
+        ("one.xml", DIMAP),
+        ("item.json", json.dumps(STAC)),
+        ("any.json", json.dumps(STAC)),
+    ],
+)
+def test_what_deliveries_say(image, name, text):
+    image.with_name(name).write_text(text)
+    assert read_acquisition(image, PLACE) == Acquisition(TIME, (161.5, 44.9), name)
+
+
+def test_airbus_names_its_files_by_the_product(tmp_path):
+    image = tmp_path / "IMG_PHR1A_P_202010250312_R1C1.TIF"
+    image.write_bytes(b"")
+    (tmp_path / "DIM_PHR1A_P_202010250312.XML").write_text(DIMAP)
+    (tmp_path / "DIM_PHR1B_P_201901010000.XML").write_text(DIMAP.replace("2020", "2019"))
+    assert read_acquisition(image, PLACE).time == TIME
+
+
+@pytest.mark.parametrize("clock", ["2020-10-25 03:12:45", "2020-10-25 11:12:45"])
+def test_the_sun_tells_the_zone_of_gaofen_times(image, clock):
+    text = GF.format(time=clock, azimuth=SUN[0] + 0.2, zenith=90 - SUN[1] + 0.1)
+    image.with_name("one.xml").write_text(text)
+    said = read_acquisition(image, PLACE)
+    assert said.time == TIME
+    assert said.sun == pytest.approx((SUN[0] + 0.2, SUN[1] - 0.1))
+
+
+def test_without_sun_it_is_computed_and_without_zone_there_is_no_time(image):
+    item = json.loads(json.dumps(STAC))
+    del item["properties"]["view:sun_azimuth"]
+    image.with_name("one.json").write_text(json.dumps(item))
+    assert read_acquisition(image, PLACE).sun == pytest.approx(SUN)
+    image.with_name("one.json").unlink()
+    image.with_name("one.xml").write_text(
+        "<ProductMetaData><CenterTime>2020-10-25 03:12:45</CenterTime></ProductMetaData>"
+    )
+    assert read_acquisition(image, PLACE) == Acquisition()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("other.IMD", IMD),
+        ("other.xml", DIMAP),
+        ("one.xml", "<ProductMetaData>"),
+        ("one.json", "[1, 2]"),
+        ("one.json", "{"),
+        ("one.IMD", "firstLineTime = yesterday;"),
+    ],
+)
+def test_files_of_other_images_and_damaged_ones_say_nothing(image, name, text):
+    image.with_name(name).write_text(text)
+    assert read_acquisition(image, PLACE) == Acquisition()

@@ -1,0 +1,275 @@
+"""Original images as the stages read them."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from stereotruth.core.config.labels import Rectify
+from stereotruth.core.errors import InputError
+from stereotruth.sensor.image_reader import Source, band_weights, open_pair
+
+from ...synthetic.images import pattern
+
+X, Y = np.meshgrid(np.arange(96.0), np.arange(80.0))
+GREY = pattern(X / 2, Y / 2).round()
+
+
+def write(path: Path, *bands: np.ndarray, mask: np.ndarray | None = None, **options) -> Path:
+    rows, cols = bands[0].shape
+    shape = {"width": cols, "height": rows, "count": len(bands), "dtype": bands[0].dtype}
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=options.pop("internal", True)),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", driver="GTiff", **shape, **options) as dataset:
+            for k, band in enumerate(bands, 1):
+                dataset.write(band, k)
+            if mask is not None:
+                dataset.write_mask(mask)
+    return path
+
+
+def pixels(path: Path) -> tuple[np.ndarray, float]:
+    with Source(path) as source:
+        return source.read(0, 0, *source.size), source.gain
+
+
+def holes(path: Path) -> np.ndarray:
+    return np.isnan(pixels(path)[0])
+
+
+def test_several_bands(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "rgb.tif"
+    shape = {"width": 9, "height": 8, "count": 3, "dtype": "uint8", "photometric": "RGB"}
+    with (
+        pytest.warns(NotGeoreferencedWarning),
+        rasterio.open(path, "w", driver="GTiff", **shape) as dataset,
+    ):
+        dataset.write(np.full((3, 8, 9), 5, dtype=np.uint8))
+    with caplog.at_level(logging.WARNING, "stereotruth"), Source(path) as source:
+        assert source.size == (9, 8)
+        assert source.read(2, 1, 4, 3).shape == (3, 4)
+    assert "rgb.tif has 3 bands; band 1 (red) is used" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("dtype", "fill"),
+    [("int16", -9999), ("int16", -32768), ("int32", -9999), ("float32", -9999), ("float64", -1e38)],
+)
+def test_undeclared_fill_values_have_no_value(tmp_path, dtype, fill, caplog) -> None:
+    """They were valid pixels of 1."""
+    values = GREY.astype(dtype)
+    values[10:20, 30:50] = fill
+    path = write(tmp_path / "a.tif", values)
+    with caplog.at_level(logging.WARNING, "stereotruth"):
+        got, gain = pixels(path)
+    np.testing.assert_array_equal(np.isnan(got), values == fill)
+    np.testing.assert_array_equal(got[~np.isnan(got)], GREY[values != fill].astype(np.float32))
+    assert gain == 1
+    assert caplog.text.count("taken as nodata; declare its nodata value") == 1
+
+
+def test_noise_of_reflectances_stays(tmp_path) -> None:
+    values = (GREY / 2000).astype(np.float32)
+    values[5, 5] = -0.001
+    got, gain = pixels(write(tmp_path / "a.tif", values))
+    assert np.isfinite(got).all()
+    assert gain == pytest.approx(10000 / values.max())
+
+
+@pytest.mark.parametrize("scale", [1.0, 1 / 4096])
+def test_a_hot_pixel_does_not_flatten_the_image(tmp_path, scale, caplog) -> None:
+    values = (GREY * scale).astype(np.float32)
+    values[40, 40] = 3e30
+    with caplog.at_level(logging.WARNING, "stereotruth"):
+        got, gain = pixels(write(tmp_path / "a.tif", values))
+    assert 1000 < np.delete(got.ravel(), 40 * 96 + 40).max() < 15000
+    assert got[values < 1e30] == pytest.approx(values[values < 1e30] * gain, rel=1e-6)
+    assert "hot pixels" in caplog.text
+
+
+@pytest.mark.parametrize("dtype", ["uint32", "int32"])
+def test_wide_integers_do_not_saturate(tmp_path, dtype) -> None:
+    values = (GREY * 1000).astype(dtype)
+    got, gain = pixels(write(tmp_path / "a.tif", values))
+    assert gain == pytest.approx(10000 / values.max())
+    np.testing.assert_allclose(got, values * gain, rtol=1e-6)
+    assert pixels(write(tmp_path / "b.tif", GREY.astype(dtype)))[1] == 1  # as they are
+
+
+@pytest.mark.parametrize("internal", [True, False])
+def test_what_a_mask_hides_has_no_value(tmp_path, internal) -> None:
+    mask = np.full(GREY.shape, 255, np.uint8)
+    mask[3:9, 4:8] = 0
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=mask, internal=internal)
+    np.testing.assert_array_equal(holes(path), mask == 0)
+
+
+@pytest.mark.parametrize("nodata", [None, 5])
+def test_what_is_transparent_has_no_value(tmp_path, nodata) -> None:
+    values, alpha = GREY.astype(np.uint16), np.full(GREY.shape, 65535, np.uint16)
+    alpha[3:9, 4:8] = 0
+    values[30, 30] = 5
+    path = write(tmp_path / "a.tif", values, alpha, alpha="yes", nodata=nodata)
+    expected = alpha == 0
+    expected[30, 30] = nodata is not None
+    np.testing.assert_array_equal(holes(path), expected)
+
+
+@pytest.mark.parametrize("dtype", ["complex64", "complex_int16"])
+def test_complex_images_are_refused(tmp_path, dtype) -> None:
+    path = tmp_path / "a.tif"
+    with pytest.warns(NotGeoreferencedWarning):
+        rasterio.open(path, "w", driver="GTiff", width=9, height=8, count=1, dtype=dtype).close()
+    with pytest.raises(InputError, match=r"a.tif: complex image"):
+        Source(path)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "uint32", "uint16"])
+@pytest.mark.parametrize("options", [{}, {"compress": "deflate"}])
+def test_truncated_images_are_refused(tmp_path, dtype, options) -> None:
+    path = write(tmp_path / "a.tif", GREY.astype(dtype), **options)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    with pytest.raises(InputError, match=r"a.tif: .*Remedy"), Source(path) as source:
+        source.check_blocks()
+        source.read(0, 0, *source.size)
+
+
+def test_a_file_that_fetches_its_pixels_is_no_image(tmp_path) -> None:
+    """Whatever its name: GDAL would make requests, and read any file."""
+    write(tmp_path / "b.tif", GREY.astype(np.uint16))
+    (tmp_path / "a.tif").write_text(
+        '<VRTDataset rasterXSize="96" rasterYSize="80"><VRTRasterBand dataType="UInt16" band="1">'
+        '<SimpleSource><SourceFilename relativeToVRT="1">b.tif</SourceFilename><SourceBand>1'
+        "</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    with pytest.warns(NotGeoreferencedWarning), rasterio.open(tmp_path / "a.tif") as dataset:
+        assert dataset.driver == "VRT"
+    with pytest.raises(InputError, match=r"a.tif: not a raster that GDAL can read"):
+        Source(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("shape", [(1, 1_000_001), (40_000, 40_000)])
+def test_sizes_of_damaged_headers_are_refused(tmp_path, shape) -> None:
+    path = tmp_path / "a.tif"
+    size = {"height": shape[0], "width": shape[1], "blockysize": shape[0], "compress": "lzw"}
+    with pytest.warns(NotGeoreferencedWarning):
+        rasterio.open(
+            path, "w", driver="GTiff", count=1, dtype="uint16", sparse_ok=True, **size
+        ).close()
+    with pytest.raises(InputError, match=r"no image of a satellite|can only be read as a whole"):
+        Source(path)
+
+
+def test_what_a_mask_file_hides_is_not_read(tmp_path) -> None:
+    """Not zero: masked. Who asks for the mask gets the values under it, too."""
+    cloud = np.zeros(GREY.shape, np.uint8)
+    cloud[10:20, 30:50], cloud[40, 40] = 255, 1
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
+    mask = write(tmp_path / "cloud.tif", cloud)
+    with Source(path, mask) as source:
+        assert source.masks
+        np.testing.assert_array_equal(np.isnan(source.read(0, 0, *source.size)), cloud > 0)
+        (values,), hidden = source.read_layers(25, 5, 60, 50)
+    np.testing.assert_array_equal(values, GREY[5:55, 25:85])
+    np.testing.assert_array_equal(hidden, cloud[5:55, 25:85] > 0)
+
+
+def test_own_mask_and_mask_file_add_up(tmp_path) -> None:
+    own, cloud = np.full(GREY.shape, 255, np.uint8), np.zeros(GREY.shape, np.float32)
+    own[3:9, 4:8], cloud[50:60, 60:70] = 0, 0.5
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=own)
+    with Source(path, write(tmp_path / "cloud.tif", cloud)) as source:
+        (values,), hidden = source.read_layers(0, 0, *source.size)
+    np.testing.assert_array_equal(np.isnan(values), own == 0)
+    np.testing.assert_array_equal(hidden, (own == 0) | (cloud > 0))
+
+
+@pytest.mark.parametrize("by", ["alpha", "mask"])
+def test_zeros_that_a_mask_shows_are_values(tmp_path, by) -> None:
+    """As shadows in images of 8 bits; of a file without a mask they are nodata."""
+    values = GREY.clip(0, 250).astype(np.uint8)
+    values[10:30, 20:60], shown = 0, np.full(GREY.shape, 255, np.uint8)
+    shown[70:, :] = 0
+    if by == "alpha":
+        path = write(tmp_path / "a.tif", values, shown, alpha="YES")
+    else:
+        path = write(tmp_path / "a.tif", values, mask=shown)
+    np.testing.assert_array_equal(holes(path), shown == 0)
+    assert holes(write(tmp_path / "b.tif", values))[10:30, 20:60].all()
+
+
+def test_a_mask_of_two_bands_is_refused(tmp_path) -> None:
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
+    mask = write(tmp_path / "cloud.tif", *np.zeros((2, *GREY.shape), np.uint8))
+    with pytest.raises(InputError, match=r"cloud\.tif: 2 bands of uint8 are no mask.*Remedy"):
+        Source(path, mask)
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path) -> None:
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16))
+    mask = write(tmp_path / "cloud.tif", np.zeros((10, 12), np.uint8))
+    with pytest.raises(InputError, match=r"cloud.tif: a mask of 12 x 10 .* a.tif of 96 x 80"):
+        Source(path, mask)
+
+
+COLOURED = {"photometric": "RGB"}
+
+
+def coloured(path: Path, **options) -> Path:
+    """Red, green, blue and near infrared, each a multiple of the other; a hole in all, in one."""
+    bands = [(GREY * k).astype(np.uint16) for k in (1, 2, 3, 5)]
+    for band in bands:
+        band[10, 10] = 0
+    bands[0][20, 20] = 0
+    return write(path, *bands, **COLOURED, **options)
+
+
+def test_colours_and_a_mix_of_bands_are_read(tmp_path) -> None:
+    path = coloured(tmp_path / "a.tif")
+    with Source(path, mix={2: 0.75, 4: 0.25}, colour=(3, 2, 1)) as source:
+        layers, _ = source.read_layers(0, 0, *source.size)
+        np.testing.assert_array_equal(source.read(0, 0, *source.size), layers[0])
+    there = np.ones(GREY.shape, bool)
+    there[10, 10] = there[20, 20] = False
+    for layer, factor in zip(layers, (0.75 * 2 + 0.25 * 5, 3, 2, 1)):
+        np.testing.assert_allclose(layer[there], (GREY * factor)[there], rtol=1e-6)
+    assert np.isnan(layers[:, 10, 10]).all()
+    assert layers[3, 20, 20] == 0  # dark in one band is not nodata
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [({}, (1, 2, 3)), ({"colour": None}, ()), ({"colour": (4, 1, 2)}, (4, 1, 2))],
+)
+def test_colour_is_what_both_images_call_so(tmp_path, options, expected, caplog) -> None:
+    pair = [coloured(tmp_path / f"{n}.tif") for n in "ab"]
+    with open_pair(*pair, bands=Rectify(**options)) as (left, right):
+        assert left.colour == right.colour == expected
+        assert left.mix == pytest.approx(dict.fromkeys(expected, 1 / 3) if expected else {1: 1})
+    assert ("band 1 (red) is used" in caplog.text) == (not expected)
+    grey = write(tmp_path / "g.tif", GREY.astype(np.uint16))
+    if options.get("colour"):
+        with pytest.raises(InputError, match=r"g.tif: no band 4: it has 1\. .*rectify.colour"):
+            open_pair(pair[0], grey, bands=Rectify(**options)).__enter__()
+    else:
+        with open_pair(pair[0], grey, bands=Rectify(**options)) as (left, right):
+            assert left.colour == right.colour == ()
+
+
+def test_weights_of_bands_are_of_sum_one() -> None:
+    """Band 1 without colour, the mean with it, or what is named."""
+    assert band_weights(None, None) == {1: 1.0}
+    assert band_weights(None, (3, 2, 1)) == pytest.approx({3: 1 / 3, 2: 1 / 3, 1: 1 / 3})
+    assert band_weights(4, (1, 2, 3)) == {4: 1.0}
+    assert band_weights({1: 1, 2: 3}, None) == {1: 0.25, 2: 0.75}
+    with pytest.raises(InputError):
+        band_weights({}, None)

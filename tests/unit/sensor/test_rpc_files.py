@@ -1,0 +1,152 @@
+"""The readers of each format of RPC files."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereotruth.core.errors import InputError
+from stereotruth.sensor.rpc import RPC
+from stereotruth.sensor.rpc_files import read_rpc, rpc_file
+
+from ...synthetic import rpc_texts
+from ...synthetic.cameras import ground_points, make_rpc
+from ...synthetic.images import write_image
+
+# -------------------------------------------------------------------------------------- readers
+
+
+def rpc_text(rpc: RPC) -> str:
+    return rpc_texts.rpc_text(rpc.to_dict(), units=True)
+
+
+def rpb_text(rpc: RPC, spec: str = "RPC00B") -> str:
+    return rpc_texts.rpb_text(rpc.to_dict(), spec, ("\terrBias = 0.0;", "\terrRand = 0.0;"))
+
+
+def assert_same(a: RPC, b: RPC) -> None:
+    lon, lat, height = ground_points(b, 50)
+    difference = np.subtract(a.project(lon, lat, height), b.project(lon, lat, height))
+    assert np.abs(difference).max() < 1e-5  # offsets are written with ten decimals
+
+
+@pytest.mark.parametrize(
+    ("name", "writer"),
+    [
+        ("GF7_scene-BWD_RPC.TXT", rpc_text),
+        ("GF7_scene-BWD_rpc.txt", rpc_text),
+        ("GF7_scene-BWD.RPB", rpb_text),
+        ("GF7_scene-BWD.rpb", rpb_text),
+    ],
+)
+def test_files_beside_the_image(tmp_path: Path, name: str, writer) -> None:
+    rpc = make_rpc(10)
+    image = write_image(tmp_path / "GF7_scene-BWD.tiff", None)
+    for encoding in ("utf-8", "utf-8-sig"):
+        (tmp_path / name).write_text(writer(rpc), encoding=encoding)
+        assert_same(read_rpc(image), rpc)
+
+
+def test_tiff_tag(tmp_path: Path) -> None:
+    rpc = make_rpc(11)
+    assert_same(read_rpc(write_image(tmp_path / "a.tif", rpc)), rpc)
+
+
+@pytest.mark.parametrize("option", ["RPCTXT", "RPB"])
+def test_files_written_by_gdal(tmp_path: Path, option: str) -> None:
+    rpc = make_rpc(12)
+    image = write_image(tmp_path / "a.tif", rpc, **{option: "YES"})
+    assert len(list(tmp_path.iterdir())) > 1
+    assert_same(read_rpc(image), rpc)
+
+
+def test_a_file_goes_before_the_tag(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "a.tif", make_rpc(13))
+    better = make_rpc(14)
+    (tmp_path / "a_RPC.TXT").write_text(rpc_text(better))
+    assert_same(read_rpc(image), better)
+
+
+def spoiled(name: str, old: str, new: str):
+    def change(text: str) -> str:
+        assert old in text
+        return text.replace(old, new, 1)
+
+    return pytest.param(change, id=name)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        spoiled("missing-offset", "LINE_OFF:", "LINE:"),
+        spoiled("missing-coefficient", "SAMP_DEN_COEFF_7:", "SAMP_DEN_7:"),
+        spoiled("not-a-number", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: x"),
+        spoiled("not-finite", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: nan "),
+        spoiled("zero-scale", "LAT_SCALE: ", "LAT_SCALE: 0.0 "),
+        spoiled("no-degrees", "LAT_OFF: ", "LAT_OFF: 4796000.0 "),
+        spoiled("empty-value", "HEIGHT_OFF: ", "HEIGHT_OFF:\nX: "),
+        spoiled("underscore", "LINE_SCALE: ", "LINE_SCALE: 1_000\nX: "),
+        spoiled("full-width", "LINE_SCALE: ", "LINE_SCALE: １４０００\nX: "),
+        spoiled("two-numbers", "LINE_SCALE: ", "LINE_SCALE: 14 "),
+        spoiled("twice", "LINE_SCALE: ", "LINE_SCALE: 14001.0 pixels\nLINE_SCALE: "),
+        spoiled("no-sensor", "HEIGHT_SCALE: ", "HEIGHT_SCALE: -1e30\nX: "),
+        spoiled("no-image", "LINE_OFF: ", "LINE_OFF: 3e7\nX: "),
+        spoiled("huge-term", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: 1e30\nX: "),
+        spoiled("long", "LINE_OFF: ", "X: " + "y" * 2_000_000 + "\nLINE_OFF: "),
+    ],
+)
+def test_malformed_text_is_refused(tmp_path: Path, change) -> None:
+    image = write_image(tmp_path / "a.tif", None)
+    (tmp_path / "a_RPC.TXT").write_text(change(rpc_text(make_rpc(15))))
+    with pytest.raises(InputError, match=r"a_RPC.TXT: malformed RPC .*Remedy"):
+        read_rpc(image)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        spoiled("19-coefficients", "lineNumCoef = (\n", "lineNumCoef = (\n //"),
+        spoiled("missing-scale", "sampScale", "sampScal"),
+        spoiled("RPC00A", "RPC00B", "RPC00A"),
+        spoiled("cut-short", "sampDenCoef = (", "sampDenCoef = "),
+    ],
+)
+def test_malformed_rpb_is_refused(tmp_path: Path, change) -> None:
+    image = write_image(tmp_path / "a.tif", None)
+    (tmp_path / "a.rpb").write_text(change(rpb_text(make_rpc(16))))
+    with pytest.raises(InputError, match=r"a.rpb: malformed RPC .*Remedy"):
+        read_rpc(image)
+
+
+@pytest.mark.parametrize("filling", ["\n", " ", "a", "a=(", "=", "(", "\t\n"])
+@pytest.mark.parametrize(("name", "writer"), [("a_RPC.TXT", rpc_text), ("a.rpb", rpb_text)])
+def test_long_files_take_no_longer_than_their_length(tmp_path, name, writer, filling) -> None:
+    """200 000 blank lines took a pattern hours. Whatever comes of it, it comes."""
+    image = write_image(tmp_path / "a.tif", None)
+    rpc = make_rpc(17)
+    (tmp_path / name).write_text(filling * (400_000 // len(filling)) + "\n" + writer(rpc))
+    if filling.isspace():
+        assert_same(read_rpc(image), rpc)
+        return
+    with contextlib.suppress(InputError):
+        read_rpc(image)
+
+
+def test_where_an_rpc_comes_from(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "a.tif", make_rpc(13))
+    assert rpc_file(image) == image
+    (tmp_path / "A_rpc.txt").write_text(rpc_text(make_rpc(14)))
+    assert rpc_file(image) == tmp_path / "A_rpc.txt"
+
+
+def test_images_without_rpc_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a.tif: image has no RPC metadata.*a_RPC.TXT"):
+        read_rpc(write_image(tmp_path / "a.tif", None))
+    with pytest.raises(InputError, match=r"b.tif: no such image"):
+        read_rpc(tmp_path / "b.tif")
+    (tmp_path / "c.tif").write_text("no raster")
+    with pytest.raises(InputError, match=r"c.tif: not a raster"):
+        read_rpc(tmp_path / "c.tif")

@@ -1,0 +1,76 @@
+"""Rendered views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from scipy.ndimage import map_coordinates, uniform_filter
+
+from stereocities.cities import ViewSpec
+from stereocities.render import LANES, _shade_rows, prepare, simulate_image
+from stereocities.truth import open_truth
+
+from ...synthetic.small_cities import GROUND, ONE_BOX, ROOF, TOWN
+
+
+def test_views_look_alike_where_both_see_the_surface(town: Path) -> None:
+    """9 x 9 correlation of left and right at the true correspondences, as the paper's filter."""
+    truth = open_truth(town / "truth.zarr")
+    with rasterio.open(town / "left.tif") as image:
+        left = image.read(1).astype(float)
+    with rasterio.open(town / "right.tif") as image:
+        right = image.read(1).astype(float)
+    assert 150 < np.median(left) < 600 and left.max() <= 2047
+    seen = truth.visible_right.values == 1
+    at = np.stack([truth.right_row.values, truth.right_col.values])
+    warped = map_coordinates(right, np.nan_to_num(at, nan=-99), order=3)
+
+    def mean(a: np.ndarray) -> np.ndarray:
+        return uniform_filter(a, 9)
+
+    spread_left = mean(left**2) - mean(left) ** 2
+    spread = spread_left * (mean(warped**2) - mean(warped) ** 2)
+    covariance = mean(left * warped) - mean(left) * mean(warped)
+    correlation = covariance / np.sqrt(np.maximum(spread, 1e-6))
+    whole = mean(seen.astype(float)) > 0.999
+    surface = truth.surface.values
+    for kind in (GROUND, ROOF):
+        values = correlation[whole & (surface == kind)]
+        assert len(values) > 1000
+        assert np.median(values) > 0.9 and np.mean(values > 0.5) > 0.97
+    hidden = (surface > 0) & ~seen
+    assert 0.005 < hidden.mean() < 0.3
+    assert np.median(correlation[hidden]) < 0.6
+
+
+def test_a_row_is_the_same_whatever_rows_are_beside_it() -> None:
+    """LANES rows go side by side, and none has a say in another."""
+    ready = prepare(TOWN, TOWN.scenes[0])
+    camera = ready.left
+    shown = [np.empty((rows, 2 * camera.cols), np.float32) for rows in (3 * LANES, LANES + 3)]
+    for half, first in zip(shown, (100.0, 102.5)):
+        _shade_rows(camera.surfaces, camera.horizon, camera.shown, camera.cam, first, half)
+    np.testing.assert_array_equal(shown[1], shown[0][5 : 5 + len(shown[1])])
+    assert shown[0].std() > 0.01
+
+
+def test_eight_bits_saturate_where_asked_and_blur_takes_contrast(tmp_path: Path) -> None:
+    pixels = {}
+    for name, view in (
+        ("11", ViewSpec()),
+        ("8", ViewSpec(saturates=0.2)),
+        ("blurred", ViewSpec(psf_px=0.7)),
+    ):
+        city = replace(ONE_BOX, left=view)
+        simulate_image(city, city.scenes[0], "left", tmp_path / "left.tif", seed=1)
+        with rasterio.open(tmp_path / "left.tif") as image:
+            pixels[name] = image.read(1).astype(float)
+    inside = (slice(40, -40), slice(40, -40))
+    plain, few, blurred = (pixels[k][inside] for k in ("11", "8", "blurred"))
+    assert few.max() == 255 and 0.001 < np.mean(few == 255) < 0.9
+    below = few < 255
+    assert np.abs(few[below] - plain[below] * 255 / (55 + 1480 * 0.2)).max() <= 0.9
+    assert np.abs(np.diff(blurred)).mean() < 0.9 * np.abs(np.diff(plain)).mean()

@@ -1,0 +1,106 @@
+"""What images say of labels, on made matches: biases that are known, tails and clusters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereotruth.tiles import label_doubts
+from stereotruth.tiles.label_doubts import Bias, agreement, bias_of, doubts, location
+
+SCENES = 150
+NEVER = 0.01
+
+
+def matches(
+    rng: np.random.Generator,
+    cells: int = 16,
+    per_cell: int = 40,
+    tail: float = 0.2,
+    shared: float = 0.02,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (px) and cells: a core of 0.14 px, what cells share, a share of tails to one side."""
+    cell = np.repeat(np.arange(cells), rng.poisson(per_cell, cells) + 1)
+    errors = rng.normal(0, shared, cells)[cell] + rng.normal(0, 0.14, cell.size)
+    bad = rng.random(cell.size) < tail
+    errors[bad] -= rng.exponential(0.5, bad.sum())
+    return errors, cell
+
+
+def found(planted: float, stated: float = 0.01, **made) -> list[Bias]:
+    """What is said of many scenes with a planted bias, as labels of that uncertainty state it."""
+    rng = np.random.default_rng(27)
+    biases = []
+    for _ in range(SCENES):
+        errors, cell = matches(rng, **made)
+        bias = bias_of("open ground", errors + planted, cell, np.full(errors.size, stated))
+        assert bias is not None
+        biases.append(bias)
+    return biases
+
+
+def test_tails_to_one_side_move_the_location_less_than_the_median():
+    rng = np.random.default_rng(1)
+    errors, _ = matches(rng, cells=200)
+    at, influence, slope = location(errors)
+    assert abs(at) < 0.025
+    assert abs(at) < 0.5 * abs(np.median(errors))
+    assert abs(influence.mean()) < 1e-6
+    assert slope > 0.3 * errors.size
+
+
+@pytest.mark.parametrize("made", [{}, {"cells": 7, "per_cell": 15}, {"shared": 0.06}])
+def test_standard_error_is_the_scatter_of_scenes(made):
+    biases = found(0.0, tail=0.0, **made)
+    scatter = np.std([bias.value for bias in biases])
+    assert np.mean([bias.error for bias in biases]) == pytest.approx(scatter, rel=0.15)
+
+
+@pytest.mark.parametrize("made", [{}, {"cells": 8, "per_cell": 20}, {"tail": 0.3}])
+def test_a_planted_bias_is_named_with_its_amount_and_nothing_is_where_none_is(made):
+    named = [doubts([bias], NEVER) for bias in found(0.15, **made)]
+    assert np.mean([bool(of) for of in named]) >= 0.95
+    assert not any(of[0].explained for of in named if of)
+    assert np.mean([bool(doubts([bias], NEVER)) for bias in found(0.0, **made)]) <= 0.01
+    text = str(named[0][0])
+    for word in ("images say +0.1", "px of the labels of open ground", "more than the 0.01 px"):
+        assert word in text
+
+
+def test_what_the_alignment_explains_is_a_remark_if_it_is_large():
+    for bias in found(0.25, stated=0.2)[:20]:
+        (doubt,) = doubts([bias], NEVER)
+        assert doubt.explained
+        assert "within the 0.20 px" in str(doubt)
+    assert not any(doubts([bias], NEVER) for bias in found(0.05, stated=0.2)[:20])
+
+
+def test_few_cells_say_nothing_and_crowns_raise_no_doubt():
+    errors = np.random.default_rng(3).normal(0.3, 0.1, 400)
+    stated = np.full(400, 0.01)
+    assert bias_of("roofs", errors, np.arange(400) // 100, stated) is None
+    lopsided = np.where(np.arange(400) < 380, 0, np.arange(400))
+    assert bias_of("roofs", errors, lopsided, stated) is None
+    assert bias_of("roofs", errors[:0], lopsided[:0], stated[:0]) is None
+    crowns = bias_of("crowns", errors, np.arange(400) // 20, stated)
+    assert crowns is not None
+    assert crowns.value == pytest.approx(0.3, abs=0.03)
+    assert doubts([crowns], NEVER) == []
+    assert agreement([crowns]) is None
+
+
+def test_agreement_is_a_probability_of_all_that_is_judged():
+    good = [bias_of("open ground", *matches(np.random.default_rng(k)), np.zeros(1)) for k in (1, 2)]
+    assert agreement(good) > NEVER
+    far = Bias("roofs", 400, 16.0, 0.15, 0.01, 0.01)
+    chance = far.chance(far.stated)
+    assert agreement([far]) == pytest.approx(chance)
+    assert agreement([far, far]) == pytest.approx(2 * chance)
+    assert doubts([far], None) == []
+
+
+def test_equal_values_are_their_own_location():
+    bias = bias_of("roofs", np.full(60, 0.25), np.arange(60) // 6, np.zeros(60))
+    assert bias is not None
+    assert (bias.value, bias.error) == (0.25, 0.0)
+    assert bias.sigma == label_doubts.SIFT_SIGMA_PX

@@ -1,0 +1,106 @@
+"""The dataset as a STAC collection, read by pystac."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+pystac = pytest.importorskip("pystac", reason="the extra catalog is not installed")
+
+from pystac.extensions.file import FileExtension
+from pystac.extensions.projection import ProjectionExtension
+from pystac.extensions.raster import RasterExtension
+from pystac.validation.stac_validator import JsonSchemaSTACValidator
+
+from stereotruth.core.errors import InputError
+from stereotruth.sensor.rpc import RPC
+from stereotruth.sensor.rpc_files import read_rpc
+from stereotruth.tiles.published_layout import assemble_dataset
+from stereotruth.tiles.verify import defects
+
+from ...synthetic.images import write
+from ...synthetic.tiled_scene import SIZE, rows_of
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@pytest.fixture(scope="module")
+def dataset(exported, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("stac")
+    assemble_dataset([exported[0]], folder / "made", catalogs=["stac"])
+    shutil.move(folder / "made", folder / "moved")  # links are relative
+    return folder / "moved"
+
+
+def test_the_collection_holds_an_item_of_each_pair(dataset) -> None:
+    collection = pystac.Collection.from_file(str(dataset / "stac/collection.json"))
+    items = {item.id: item for item in collection.get_items()}
+    rows = rows_of(dataset)
+    assert set(items) == {row["tile"] for row in rows}
+    places = {
+        one["id"]: one["geometry"]
+        for one in json.loads((dataset / "footprints.geojson").read_text())["features"]
+    }
+    validator = JsonSchemaSTACValidator()
+    kind = pystac.STACObjectType.COLLECTION
+    validator.validate_core(collection.to_dict(), kind, pystac.get_stac_version())
+    for row in rows:
+        item = items[row["tile"]]
+        found = json.loads((dataset / row["item"]).read_text())
+        validator.validate_core(found, pystac.STACObjectType.ITEM, pystac.get_stac_version())
+        assert item.geometry == places[row["tile"]]
+        assert item.properties["stereotruth:split"] == row["split"]
+        assert ProjectionExtension.ext(item).shape == [SIZE, SIZE]
+        assert found["properties"]["proj:code"] is None
+        assert not item.properties["stereotruth:acquisition_known"]
+        wanted = {"left", "right", "orientation", "left_rpc", "right_rpc"}
+        assert set(item.assets) == wanted | ({"disparity"} if row["disp"] else set())
+        for name, asset in item.assets.items():
+            path = Path(asset.get_absolute_href())
+            assert not Path(asset.href).is_absolute() and path.is_relative_to(dataset)
+            said = FileExtension.ext(asset)
+            assert said.size == path.stat().st_size
+            assert said.checksum == "1220" + hashlib.sha256(path.read_bytes()).hexdigest()
+            if path.suffix == ".tiff":
+                (band,) = RasterExtension.ext(asset).bands
+                with rasterio.open(path) as raster:
+                    assert (band.data_type, band.nodata) == (raster.dtypes[0], raster.nodata)
+                assert (band.unit == "px") == (name == "disparity")
+    boxes = np.array([item.bbox for item in items.values()])
+    (whole,) = collection.extent.spatial.bboxes
+    assert whole == [*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0)]
+
+
+def test_rpcs_are_those_of_the_orientation_files(dataset, tmp_path) -> None:
+    row = rows_of(dataset)[0]
+    record = json.loads((dataset / row["orientation"]).read_text())
+    for view in ("left", "right"):
+        write(tmp_path / f"{view}.tif", np.zeros((4, 4), np.uint8))
+        text = dataset / f"stac/rpc/{row['scene']}_{view}_RPC.TXT"
+        shutil.copyfile(text, tmp_path / f"{view}_RPC.TXT")
+        wanted = RPC.from_dict(record[view]["corrected_rpc"])
+        assert read_rpc(tmp_path / f"{view}.tif").to_dict() == wanted.to_dict()
+
+
+def test_verify_knows_its_files(dataset, tmp_path) -> None:
+    assert defects(dataset) == []
+    shutil.copytree(dataset, tmp_path / "d")
+    item = tmp_path / "d" / rows_of(dataset)[0]["item"]
+    item.write_text(item.read_text() + " ")
+    assert defects(tmp_path / "d") == [f"{item.relative_to(tmp_path / 'd')}: changed"]
+
+
+def test_dates_are_told(exported, tmp_path) -> None:
+    scene = rows_of(exported[0])[0]["scene"]
+    out = tmp_path / "out"
+    with pytest.raises(InputError, match=f"dataset.acquired.{scene}: 'May' is no date"):
+        assemble_dataset([exported[0]], out, catalogs=["stac"], acquired={scene: "May"})
+    assemble_dataset([exported[0]], out, catalogs=["stac"], acquired={scene: "2020-10-25"})
+    collection = pystac.Collection.from_file(str(out / "stac/collection.json"))
+    assert all(str(i.datetime.date()) == "2020-10-25" for i in collection.get_items())

@@ -1,0 +1,170 @@
+"""Datasets on disk, in the three layouts and in none."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereotruth.core.errors import InputError
+from stereotruth.core.products.rasters import read_disparity, read_image
+from stereotruth.tiles.stereo_dataset import StereoDataset, find_pairs
+
+from ...synthetic.images import write
+from ...synthetic.real_data import PUBLISHED
+
+needs_published = pytest.mark.skipif(not PUBLISHED.is_dir(), reason="no published pairs here")
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def whu_pair(folder: Path, name: str, *, kinds=("left", "right", "disparity")) -> None:
+    prefix, number = name.split("_")
+    for kind in kinds:
+        place = folder / ("disp" if kind == "disparity" else kind)
+        write(place / f"{prefix}_{kind}_{number}.tiff", np.ones((4, 6), np.uint16))
+
+
+def us3d_pair(folder: Path, name: str, endings=("LEFT_RGB", "RIGHT_RGB", "LEFT_DSP")) -> None:
+    for ending in endings:
+        bands = 3 if "RGB" in ending else 1
+        write(folder / f"{name}_{ending}.tif", np.ones((4, 6, bands), np.uint8))
+
+
+def test_the_published_layout_is_read_with_and_without_truth(tmp_path):
+    for split in ("train", "val", "test"):
+        whu_pair(tmp_path / "with ground truth" / split, f"KM_{len(split)}")
+    whu_pair(tmp_path / "without ground truth", "WH_7", kinds=("left", "right"))
+    for layout in ("whu", "stereotruth"):  # the latter without its manifest
+        pairs = find_pairs(tmp_path, layout)
+        assert [(p.name, p.city, p.split) for p in pairs] == [
+            ("WH_7", "Wuhan", "none"),
+            ("KM_4", "Kunming", "test"),
+            ("KM_5", "Kunming", "train"),
+            ("KM_3", "Kunming", "val"),
+        ]
+        assert [p.disparity is None for p in pairs] == [True, False, False, False]
+        assert all(file.is_file() for p in pairs for file in (p.left, p.right))
+
+
+def test_loose_files_are_of_split_test_and_in_the_order_of_their_numbers(tmp_path):
+    for number in (10, 9, 100):
+        write(tmp_path / f"SG_left_{number}.tiff", np.ones((4, 6), np.uint16))
+        write(tmp_path / f"SG_right_{number}.tiff", np.ones((4, 6), np.uint16))
+    pairs = find_pairs(tmp_path, "whu")
+    assert [p.name for p in pairs] == ["SG_9", "SG_10", "SG_100"]
+    assert {p.split for p in pairs} == {"test"} and pairs[0].disparity is None
+
+
+def test_splits_may_be_links_to_another_disk(tmp_path):
+    for split in ("train", "test"):
+        whu_pair(tmp_path / "disk" / split, "KM_1")
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    for split in ("train", "test"):
+        (whole / split).symlink_to(tmp_path / "disk" / split)
+    (tmp_path / "disk" / "test" / "back").symlink_to(whole)  # leads in a circle
+    pairs = find_pairs(whole, "whu")
+    assert sorted(p.split for p in pairs) == ["test", "train"]
+    assert all(file.is_file() for p in pairs for file in (p.left, p.right, p.disparity))
+
+
+def test_the_own_layout_follows_its_manifest(tmp_path):
+    whu_pair(tmp_path / "x", "ZZ_1")
+    rows = [
+        "tile,city,split,left,right,disp,scene",
+        "ZZ_1,Zed,val,x/left/ZZ_left_1.tiff,x/right/ZZ_right_1.tiff,x/disp/ZZ_disparity_1.tiff,Z-1",
+        "ZZ_2,Zed,test,x/left/ZZ_left_1.tiff,x/right/ZZ_right_1.tiff,,Z-1",
+    ]
+    (tmp_path / "manifest.csv").write_text("\n".join(rows) + "\n")
+    none, val = find_pairs(tmp_path, "stereotruth")
+    assert (val.name, val.city, val.split, val.row["scene"]) == ("ZZ_1", "Zed", "val", "Z-1")
+    assert none.split == "none" and none.disparity is None
+    (tmp_path / "x/right/ZZ_right_1.tiff").unlink()
+    with pytest.raises(InputError, match=r"ZZ_right_1\.tiff is missing"):
+        find_pairs(tmp_path, "stereotruth")
+
+
+def test_us3d_may_keep_its_truth_elsewhere(tmp_path):
+    us3d_pair(tmp_path / "Train-Track2-RGB-1", "JAX_004_007_006", ("LEFT_RGB", "RIGHT_RGB"))
+    us3d_pair(tmp_path / "Train-Track2-Truth", "JAX_004_007_006", ("LEFT_DSP",))
+    us3d_pair(tmp_path / "Validate-Track2", "OMA_247_027_001", ("LEFT_RGB", "RIGHT_RGB"))
+    us3d_pair(tmp_path / "flat", "XYZ_1_2_3")
+    found = {p.name: (p.city, p.split, p.disparity is None) for p in find_pairs(tmp_path, "us3d")}
+    assert found == {
+        "JAX_004_007_006": ("Jacksonville", "train", False),
+        "OMA_247_027_001": ("Omaha", "val", True),
+        "XYZ_1_2_3": ("XYZ", "test", False),
+    }
+
+
+def test_equal_names_in_two_splits_get_the_split_in_front(tmp_path):
+    for split in ("train", "test"):
+        whu_pair(tmp_path / split, "KM_1")
+    assert [p.name for p in find_pairs(tmp_path, "whu")] == ["test_KM_1", "train_KM_1"]
+    shutil.copytree(tmp_path / "train", tmp_path / "copy" / "train")
+    with pytest.raises(InputError, match="named train_KM_1"):
+        find_pairs(tmp_path, "whu")
+
+
+def test_what_is_wrong_with_a_folder_is_told(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        find_pairs(tmp_path / "nowhere", "whu")
+    with pytest.raises(InputError, match="no layout 'middlebury'"):
+        find_pairs(tmp_path, "middlebury")
+    us3d_pair(tmp_path, "JAX_1_2_3")
+    with pytest.raises(InputError, match=r"\*_left_\*\.tiff.*layout stereotruth or kitti or us3d"):
+        find_pairs(tmp_path, "whu")
+    (tmp_path / "JAX_1_2_3_RIGHT_RGB.tif").unlink()
+    with pytest.raises(InputError, match=r"partner JAX_1_2_3_RIGHT_RGB\.tif is missing"):
+        find_pairs(tmp_path, "us3d")
+    us3d_pair(tmp_path, "JAX_1_2_3")
+    us3d_pair(tmp_path / "again", "JAX_1_2_3")
+    with pytest.raises(InputError, match="same name"):
+        find_pairs(tmp_path, "us3d")
+
+
+def test_a_labelled_split_must_be_complete(tmp_path):
+    whu_pair(tmp_path / "train", "KM_1")
+    whu_pair(tmp_path / "train", "KM_2", kinds=("left", "right"))
+    with pytest.raises(InputError, match=r"partner KM_disparity_2\.tiff is missing"):
+        find_pairs(tmp_path, "whu")
+
+
+def test_a_split_without_pairs_is_refused(tmp_path):
+    whu_pair(tmp_path / "train", "KM_1")
+    settings = {"root": str(tmp_path), "layout": "whu", "disparity_range": [-8, 8]}
+    dataset = StereoDataset.of("mine", settings)
+    assert len(dataset.pairs("train", labelled=True)) == 1
+    with pytest.raises(InputError, match=r"no labelled pairs of split 'test'; pairs:.*train"):
+        dataset.pairs("test", labelled=True)
+    with pytest.raises(InputError, match="is empty"):
+        StereoDataset.of("mine", settings | {"disparity_range": [8, 8]})
+
+
+@needs_published
+def test_the_published_pairs_are_found():
+    first, second = find_pairs(PUBLISHED / "us3d", "us3d")
+    assert (first.city, first.split, second.name) == ("Jacksonville", "test", "JAX_264_014_007")
+    assert read_image(first.left).shape == (1024, 1024, 3)
+    labels = read_disparity(first.disparity)
+    assert 0.1 < np.isnan(labels).mean() < 0.3 and np.nanmin(labels) > -96
+    (pair,) = find_pairs(PUBLISHED / "whu", "whu")
+    assert (pair.name, pair.city, pair.disparity) == ("KM_253", "Kunming", None)
+
+
+def test_names_of_files_that_are_no_plain_names_are_refused(tmp_path):
+    """They become names of products, and of keys of tables."""
+    for layout, left, right in (
+        ("whu", "S\\G_left_1.tiff", "S\\G_right_1.tiff"),
+        ("us3d", "A\aB_LEFT_RGB.tif", "A\aB_RIGHT_RGB.tif"),
+        ("kitti", "image_2/.._10.png", "image_3/.._10.png"),
+        ("whu", f"{'x' * 110}_left_1.tiff", f"{'x' * 110}_right_1.tiff"),
+    ):
+        root = tmp_path / str(len(left)) / layout
+        for file in (left, right):
+            (root / file).parent.mkdir(parents=True, exist_ok=True)
+            (root / file).touch()
+        with pytest.raises(InputError, match="the name of a pair, "):
+            find_pairs(root, layout)

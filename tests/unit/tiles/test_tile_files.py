@@ -1,0 +1,160 @@
+"""The files of a tile, as other programs read them."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import zarr
+from scipy.ndimage import map_coordinates
+
+from stereotruth.core.products.rasters import read_image, read_tile, write_tiff
+from stereotruth.sensor.colours import COLOURS
+from stereotruth.tiles.scene_stores import SceneFiles
+from stereotruth.tiles.tile_files import round_disparity
+
+from ...synthetic.other_programs import PROGRAMS
+from ...synthetic.pictures import colours_in, read_picture
+from ...synthetic.tiled_scene import SIZE, labels, make_scene, read, rows_of, run
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_right_tile_warped_by_the_disparity_is_the_left_tile(exported: tuple[Path, dict]) -> None:
+    folder, _ = exported
+    checked = 0
+    for row in rows_of(folder):
+        if row["complete"] == "yes":
+            left, right = (read(folder / row[k]).astype(np.float64) for k in ("left", "right"))
+            disparity = labels(folder / row["disp"])
+            y, x = np.mgrid[:SIZE, :SIZE]
+            match = x - disparity
+            use = np.isfinite(disparity) & (match > 4) & (match < SIZE - 5)
+            warped = map_coordinates(right, [y[use], match[use]], order=3)
+            # Texture ±360, 0.02 px of cubic interpolation: 1 to 2 grey values.
+            assert np.abs(warped - left[use]).mean() < 2.5
+            shifted = map_coordinates(right, [y[use], match[use] + 1.0], order=3)
+            assert np.abs(shifted - left[use]).mean() > 10
+            checked += 1
+    assert checked >= 12
+
+
+def test_half_precision_tiff(tmp_path: Path) -> None:
+    """16 bits of IEEE float as the TIFF tags say, bytes as NumPy's float16, read back by GDAL."""
+    values = np.linspace(-200, 200, 64 * 64).reshape(64, 64)
+    stored = round_disparity(values, "float16")
+    assert np.abs(stored - values)[np.abs(values) < 128].max() <= 1 / 32
+    assert np.abs(stored - values).max() <= 1 / 16
+    path = tmp_path / "half.tiff"
+    write_tiff(path, stored, nodata=-999, half=True)
+    with rasterio.open(path) as dataset:
+        assert np.array_equal(dataset.read(1), stored) and dataset.nodata == -999
+    data = path.read_bytes()
+    assert data[:4] == b"II*\0"
+    (start,) = struct.unpack_from("<I", data, 4)
+    tags = {}
+    for k in range(struct.unpack_from("<H", data, start)[0]):
+        tag, kind, _, value = struct.unpack_from("<HHII", data, start + 2 + 12 * k)
+        tags[tag] = value & 0xFFFF if kind == 3 else value
+    assert (tags[258], tags[339], tags[259], tags[317]) == (
+        16,
+        3,
+        8,
+        1,
+    )  # bits, IEEE, deflate, none
+    import zlib
+
+    raw = zlib.decompressobj().decompress(data[tags[273] :])
+    assert np.array_equal(np.frombuffer(raw, "<f2"), stored.astype("f2").ravel())
+
+
+@pytest.fixture(scope="module")
+def of_both_views(scene: SceneFiles, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tiles with labels of the right view too (here those of the left: only the files matter)."""
+    folder = tmp_path_factory.mktemp("both") / "Town"
+    run([scene._replace(disparity_of_right=scene.disparity)], folder)
+    return folder
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_opens_the_tiles(
+    of_both_views: Path, scene: SceneFiles, program: str
+) -> None:
+    """What each reads are the values of the scene's stores."""
+    left, right, labels_of = (
+        zarr.open_group(path, mode="r") for path in (scene.left, scene.right, scene.disparity)
+    )
+    for row in rows_of(of_both_views)[::5]:
+        assert float(row["disparity_rounding_px"] or 0) <= 1 / 2048
+        offset = int(row["right_offset_px"])
+        rows = slice(int(row["row0"]), int(row["row0"]) + SIZE)
+        here = (rows, slice(int(row["col0"]), int(row["col0"]) + SIZE))
+        there = (rows, slice(here[1].start - offset, here[1].stop - offset))
+        wanted = {"left": left["image"][here], "right": right["image"][there]}
+        if row["complete"] == "yes":
+            for end, window in (("", here), ("_right", there)):
+                disparity = labels_of["disparity"][window].astype(np.float64) - offset
+                wanted[f"disp{end}"] = np.where(np.isfinite(disparity), disparity, -999)
+                wanted[f"status{end}"] = labels_of["status"][window]
+        for kind, values in wanted.items():
+            found = PROGRAMS[program](of_both_views / row[kind])
+            if kind.startswith("disp"):
+                assert found.dtype == np.float32
+                assert np.abs(found - values).max() <= 1 / 2048
+                assert np.array_equal(found == -999, values == -999)
+            else:
+                assert found.dtype == values.dtype
+                assert np.array_equal(found, values)
+
+
+@pytest.fixture(scope="module")
+def in_colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneFiles]:
+    folder = tmp_path_factory.mktemp("colour")
+    scene = make_scene(folder / "Town-1", bare_from=240, colour=True)
+    run([scene], folder / "Town", contact_sheet=folder / "contact.png")
+    return folder / "Town", scene
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_program_opens_tiles_in_colour(in_colour, program: str) -> None:
+    folder, scene = in_colour
+    stores = {view: zarr.open_group(getattr(scene, view), mode="r") for view in ("left", "right")}
+    row = rows_of(folder)[0]
+    for view, col in (("left", 0), ("right", -int(row["right_offset_px"]))):
+        rows = slice(int(row["row0"]), int(row["row0"]) + SIZE)
+        cols = slice(int(row["col0"]) + col, int(row["col0"]) + col + SIZE)
+        wanted = np.stack([stores[view][name][rows, cols] for name in COLOURS], axis=-1)
+        found = PROGRAMS[program](folder / row[view])
+        if program == "Pillow":
+            wanted = wanted >> 8
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_tiles_in_colour_are_read_like_others(in_colour, exported: tuple[Path, dict]) -> None:
+    """Same windows and labels as of the grey image; the project's readers give both."""
+    folder, _ = in_colour
+    for row, grey in zip(rows_of(folder), rows_of(exported[0])):
+        for column in ("row0", "col0", "disp_sha256", "split", "sift_matches", "warp_correlation"):
+            assert row[column] == grey[column]
+        assert row["left_sha256"] != grey["left_sha256"]
+        image = read_image(folder / row["left"])
+        assert image.shape == (SIZE, SIZE, 3)
+        np.testing.assert_array_equal(image[..., 0], read_image(exported[0] / grey["left"]))
+        mean = read_tile(folder / row["left"])
+        np.testing.assert_array_equal(mean, image.mean(axis=2))
+    contact = read_picture(folder.parent / "contact.png")
+    assert colours_in(contact) > 0.1
+
+
+def test_the_papers_16_bits_can_be_chosen(scene: SceneFiles, tmp_path: Path) -> None:
+    run([scene], tmp_path / "T", disparity_dtype="float16")
+    row = rows_of(tmp_path / "T")[0]
+    with rasterio.open(tmp_path / "T" / row["disp"]) as dataset:
+        half = dataset.tags(1, ns="IMAGE_STRUCTURE").get("NBITS") == "16"  # before GDAL 3.11
+        assert half or dataset.dtypes == ("float16",)
+    values = labels(tmp_path / "T" / row["disp"])
+    assert 1e-4 < float(row["disparity_rounding_px"]) <= 1 / 128
+    assert np.array_equal(values.astype(np.float16), values, equal_nan=True)

@@ -1,0 +1,91 @@
+"""Tiles against their checksums."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from stereotruth.core.errors import InputError
+from stereotruth.tiles.published_layout import assemble_dataset
+from stereotruth.tiles.scene_stores import SceneFiles
+from stereotruth.tiles.verify import defects, foreign_files, verify
+
+from ...synthetic.tiled_scene import run
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+def test_checksums_find_an_edited_file(scene: SceneFiles, tmp_path: Path) -> None:
+    folder = tmp_path / "Town"
+    run([scene], folder)
+    assert defects(folder) == []
+    assert verify([folder])[str(folder)] > 60
+    victim = folder / "disp" / "TN_disparity_3.tiff"
+    data = bytearray(victim.read_bytes())
+    data[-1] ^= 1
+    victim.write_bytes(data)
+    (folder / "left" / "TN_left_0.tiff").unlink()
+    (folder / "left" / "stray.txt").write_text("x")
+    assert sorted(defects(folder)) == [
+        "disp/TN_disparity_3.tiff: changed",
+        "left/TN_left_0.tiff: missing",
+        "left/stray.txt: not in the manifest",
+    ]
+    with pytest.raises(InputError, match="TN_disparity_3"):
+        verify([folder])
+    with pytest.raises(InputError, match=r"TN_disparity_3|TN_left_0"):
+        assemble_dataset([folder], tmp_path / "dataset")
+    assert not (tmp_path / "dataset").exists()
+
+
+def test_files_of_other_programs_are_named_and_left_alone(
+    exported: tuple[Path, dict], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "Town"
+    shutil.copytree(exported[0], folder)
+    tile = folder / "disp/TN_disparity_0.tiff"
+    foreign = [
+        "disp/TN_disparity_0.tiff.aux.xml",
+        "disp/TN_disparity_0.tiff.ovr",
+        "left/.DS_Store",
+        "left/Thumbs.db",
+        "map.qgz",
+    ]
+    for name in (*foreign, "right/.hidden"):
+        (folder / name).write_text("x")
+    assert foreign_files(folder) == foreign
+    with caplog.at_level(logging.INFO, logger="stereotruth"):
+        assert verify([folder])[str(folder)] > 60
+    (line,) = (m for m in caplog.messages if "other programs" in m)
+    assert line == f"{folder}: files of other programs, left alone: {', '.join(foreign)}"
+    assert all((folder / name).is_file() for name in foreign)
+
+    os.truncate(tile, tile.stat().st_size - 1)
+    (folder / "left/TN_left_0.tiff").unlink()
+    (folder / "left/TN_left_0.tiff.aux.xml").write_text("x")  # is no excuse for a missing tile
+    (folder / "left/TN_left_99.tiff").write_text("x")
+    assert sorted(defects(folder)) == [
+        "disp/TN_disparity_0.tiff: changed",
+        "left/TN_left_0.tiff: missing",
+        "left/TN_left_99.tiff: not in the manifest",
+    ]
+    with pytest.raises(InputError, match="3 files differ"):
+        verify([folder])
+
+
+@pytest.mark.parametrize("change", [b"", b"{}", b"[3]", b"\xff{", None])
+def test_export_json_keeps_its_own_digest(
+    exported: tuple[Path, dict], tmp_path: Path, change: bytes | None
+) -> None:
+    folder = tmp_path / "Town"
+    shutil.copytree(exported[0], folder)
+    assert defects(folder) == []
+    file = folder / "export.json"
+    file.write_bytes(
+        file.read_bytes().replace(b'"size_px": ', b'"size_px": 1') if change is None else change
+    )
+    assert defects(folder)[0] == "export.json: changed"
