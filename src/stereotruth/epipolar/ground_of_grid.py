@@ -22,8 +22,8 @@ def with_ground(grid: xr.Dataset) -> xr.Dataset:
     ``grid``: of :func:`stereotruth.core.products.grids.open_grid`, with the array ``height`` (m
     over the ellipsoid) and the epipolar model in its attributes, as those of ``results/project``
     have them. Degrees, NaN where there is no height; the coordinate ``crs`` holds the system of all
-    three by the CF conventions. All of the window is read: take a part of a large grid by ``isel`` or
-    ``sel`` first. Raises InputError for a grid without heights or model.
+    three by the CF conventions. All of the window is read: take a part of a large grid by
+    ``isel`` or ``sel`` first. Raises InputError for a grid without heights or model.
     """
     for name, there in (("height", grid), ("epipolar", grid.attrs)):
         if name not in there:
