@@ -26,7 +26,7 @@ from stereotruth.core import sheets
 from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.config.section import merged
 from stereotruth.core.errors import InputError
-from stereotruth.core.numerics.error_sums import LIMITS, ErrorSum
+from stereotruth.core.numerics.statistics import LIMITS, ErrorSum
 from stereotruth.core.products.files import read_table
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.status import carries_label

@@ -28,7 +28,7 @@ from stereocities.control_points import simulate_points
 from stereocities.render import simulate_image
 from stereocities.surfaces import TREE, WATER
 from stereotruth.align.align import align
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.files import atomic_folder
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.status import Status, is_labelled

@@ -37,8 +37,8 @@ from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align, from_rpcs
 from stereotruth.align.aligned_pair import Alignment
 from stereotruth.align.refine import refine
-from stereotruth.core.config.labels import LabelSettings
-from stereotruth.core.numerics.error_sums import ErrorSum
+from stereotruth.core.config.configuration import LabelSettings
+from stereotruth.core.numerics.statistics import ErrorSum
 from stereotruth.core.products.files import atomic_folder
 from stereotruth.core.products.provenance import source_digest
 from stereotruth.evaluate.epipolar_truth import write_grid_truth

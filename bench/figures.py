@@ -23,8 +23,7 @@ from scipy.ndimage import distance_transform_edt
 from synthetic_pairs import Block
 
 from stereotruth.align.control_points import ControlPoints, read_gcps
-from stereotruth.core.numerics.error_sums import LIMITS, ErrorSum
-from stereotruth.core.numerics.robust import median_and_nmad
+from stereotruth.core.numerics.statistics import LIMITS, ErrorSum, median_and_nmad
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.grids import blocks, require_complete
 from stereotruth.core.status import Status, is_labelled

@@ -38,8 +38,8 @@ from stereocities.control_points import simulate_points
 from stereocities.render import simulate_image
 from stereotruth.align.align import align
 from stereotruth.align.refine import refine
-from stereotruth.core.config.labels import LabelSettings
-from stereotruth.core.numerics.degrees import metres_per_degree
+from stereotruth.core.config.configuration import LabelSettings
+from stereotruth.core.numerics.geometry import metres_per_degree
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluate.epipolar_truth import write_grid_truth
 from stereotruth.lidar.frames import Epoch, Epochs
@@ -47,7 +47,7 @@ from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
 from stereotruth.lidar.strip_moves import move_strips
 from stereotruth.lidar.to_wgs84 import to_wgs84
-from stereotruth.project.example_city import DEMO
+from stereotruth.project.simulated_project import DEMO
 
 OFFSETS_M = (0.31, 0.0, 0.07), (-0.2, 0.25, -0.06), (0.1, -0.33, 0.09), (-0.25, -0.15, -0.08)
 DENSITIES = 10.6, 2.6, 5.0, 4.0  # points/m²

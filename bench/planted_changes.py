@@ -30,7 +30,7 @@ from scipy.ndimage import (
     uniform_filter,
 )
 
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.files import atomic_folder
 from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.image_noise import EQUAL

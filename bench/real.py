@@ -30,8 +30,8 @@ from figures import check_point_errors, draw_panels, print_records
 from numpy.typing import NDArray
 
 from stereotruth.align.control_points import ControlPoints
-from stereotruth.core.config.labels import LabelSettings
-from stereotruth.core.numerics.degrees import metres_per_degree
+from stereotruth.core.config.configuration import LabelSettings
+from stereotruth.core.numerics.geometry import metres_per_degree
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.intersection import intersect

@@ -23,8 +23,8 @@ from kernel_rates import fastest
 from throughput import decode
 
 from stereocities.sites import drawn_site
+from stereotruth.project import simulated_project
 from stereotruth.project.new_project import begin
-from stereotruth.project.project import example_city
 
 RULES = (
     "ingest", "compare_strips", "surface", "align", "refine", "adjust", "adjusted_alignment",
@@ -65,8 +65,8 @@ def make_project(folder: Path, arguments: argparse.Namespace, spacing_m: float) 
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
         begin(folder)
-        example_city.SITE, example_city.SPACING_M = site, spacing_m
-        example_city.make_site(folder)
+        simulated_project.SITE, simulated_project.SPACING_M = site, spacing_m
+        simulated_project.make_site(folder)
         command = f"pairs {city} --most {arguments.pairs} --lidar data/lidar --gcps gcps/{city}.csv"
         stereotruth(folder, *command.split())
     return city

@@ -39,7 +39,7 @@ from stereotruth.align.refine import refine
 from stereotruth.align.site_adjustment import adjust_site
 from stereotruth.align.site_pair import ScenePair, pair_alignment
 from stereotruth.align.tie_equations import write_equations
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import atomic_folder, write_table
 from stereotruth.core.products.provenance import source_digest

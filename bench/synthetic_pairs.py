@@ -27,12 +27,11 @@ from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align
 from stereotruth.align.aligned_pair import Alignment
 from stereotruth.align.refine import refine
-from stereotruth.core.config.configuration import Configuration
-from stereotruth.core.config.labels import LabelSettings
-from stereotruth.core.numerics.degrees import DEGREE_M
+from stereotruth.core.config.configuration import Configuration, LabelSettings
+from stereotruth.core.numerics.geometry import DEGREE_M
 from stereotruth.core.products.files import atomic_folder
 from stereotruth.core.products.provenance import source_digest
-from stereotruth.core.products.ungeoreferenced import open_raster
+from stereotruth.core.products.rasters import open_raster
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.evaluate.epipolar_truth import truth_window

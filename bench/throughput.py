@@ -34,7 +34,7 @@ from stereocities.lidar import simulate_lidar_tile
 from stereocities.render import simulate_image
 from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.provenance import source_digest
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.labels.project import project_scene
@@ -59,7 +59,7 @@ PROJECT_JOB = """
 import json, os, sys
 from stereotruth.labels.project import project_scene
 from stereotruth.labels.scene_inputs import SceneInputs
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.job import job
 left, right, points, out, log, alignment, settings, options = sys.argv[1:]
 points, settings = json.loads(points), LabelSettings(**json.loads(settings))

@@ -13,7 +13,7 @@ import sys
 import time
 from pathlib import Path
 
-from stereotruth.core.config.labels import Simulate
+from stereotruth.core.config.configuration import Simulate
 from stereotruth.core.errors import InputError
 
 from .cities import CITIES, CitySpec, SceneSpec, lidar_files, read_city

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stereotruth.core.numerics.degrees import DEGREE_M
+from stereotruth.core.numerics.geometry import DEGREE_M
 from stereotruth.tiles.orientation import GROUND_TOLERANCE
 from stereotruth.tiles.polynomials import fit
 

@@ -23,8 +23,7 @@ import yaml
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import job
 from stereotruth.core.products.files import atomic_file, atomic_folder
-from stereotruth.core.products.inputs import checksum
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import checksum, making
 
 from .forked_snakemake import RUN, runner, start_snakemake
 from .project import Project, copy_project, row_of

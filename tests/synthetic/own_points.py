@@ -15,7 +15,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.status import Status
 from stereotruth.labels import recipe
 from stereotruth.labels.facet_labels import facet_labels

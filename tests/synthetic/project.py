@@ -13,7 +13,7 @@ from pathlib import Path
 
 from stereocities.__main__ import make_scene
 from stereocities.cities import SceneSpec
-from stereotruth.project.example_city import DEMO
+from stereotruth.project.simulated_project import DEMO
 
 from .forked_snakemake import planner, runner, start_snakemake
 from .forks import Forker

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from stereotruth.core.config.labels import Export, Limits
+from stereotruth.core.config.configuration import Export, Limits
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel

@@ -21,7 +21,7 @@ from rasterio.transform import Affine
 
 from stereotruth.align.control_points import read_gcps
 from stereotruth.core.errors import InputError
-from stereotruth.core.numerics.degrees import continuous
+from stereotruth.core.numerics.geometry import continuous
 from stereotruth.evaluate.surface_models import score
 from stereotruth.evaluate.surface_models.reference import RasterReference
 from stereotruth.evaluate.surface_models.score import score_surface_model

@@ -16,7 +16,7 @@ import zarr
 
 from stereotruth.align.align import align
 from stereotruth.align.refine import refine
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.errors import InputError
 from stereotruth.core.status import Status
 from stereotruth.epipolar.model import EpipolarModel

@@ -19,7 +19,7 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.products import remote_files
 from stereotruth.core.products.file_parts import open_stream
 from stereotruth.core.products.grids import open_grid
-from stereotruth.core.products.ungeoreferenced import open_raster
+from stereotruth.core.products.rasters import open_raster
 
 from ..synthetic.object_storage import BUCKET, Server, serving
 from ..synthetic.project import SIZE, Project, copy_project, row_of

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from stereotruth.project.twin_project import Options, with_twin
+from stereotruth.project.simulated_project import Options, with_twin
 
 from ..synthetic import house_points as place
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from stereotruth.core.config.configuration import Configuration
-from stereotruth.project.epochs import epoch_of_city
+from stereotruth.project.project import epoch_of_city
 from stereotruth.core.errors import InputError, in_words
 from stereotruth.core.products.provenance import SOURCES, file_sha256, script_digest, source_digest
 from stereotruth.project.project import (
@@ -23,7 +23,7 @@ from stereotruth.project.project import (
     stores_of,
     surfaces_of,
 )
-from stereotruth.core.dates import epoch_year
+from stereotruth.core.tables import epoch_year
 from stereocities import cities
 
 CONDA = FILES / "envs" / "workflow.yaml"

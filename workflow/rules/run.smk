@@ -3,7 +3,7 @@
 import shutil
 import sys
 
-from stereotruth.core.products.locks import FileLock
+from stereotruth.core.products.making import FileLock
 from stereotruth.core.products.making import begin_notes, noted
 
 LOCKS = []  # held until this process ends

@@ -8,7 +8,7 @@ jobs failed or were killed in between. Times of users' files count for nothing.
 
 from functools import cache
 
-from stereotruth.core.products.inputs import Checksums
+from stereotruth.core.products.making import Checksums
 from stereotruth.core.products.provenance import digest
 
 CHECKSUMS = Checksums(Path(".snakemake", "stereotruth", "checksums"))

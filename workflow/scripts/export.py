@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from stereotruth.core.config.labels import Export
+from stereotruth.core.config.configuration import Export
 from stereotruth.core.job import job
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.making import making

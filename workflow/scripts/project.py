@@ -1,6 +1,6 @@
 """One scene's points to its disparity grid."""
 
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.job import dask_scheduler, job
 from stereotruth.core.products.making import making
 from stereotruth.labels.project import project_scene

@@ -1,6 +1,6 @@
 """One strip of a scene's points to the blocks of its disparity grid."""
 
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.job import job
 from stereotruth.core.products.grids import Strip
 from stereotruth.core.products.making import making

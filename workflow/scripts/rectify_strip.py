@@ -1,7 +1,7 @@
 """One strip of an aligned pair to blocks of its epipolar images."""
 
 from stereotruth.align.aligned_pair import Alignment
-from stereotruth.core.config.labels import Rectify
+from stereotruth.core.config.configuration import Rectify
 from stereotruth.core.job import job
 from stereotruth.core.products.grids import Strip
 from stereotruth.core.products.making import making

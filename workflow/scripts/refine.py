@@ -4,7 +4,7 @@ from stereotruth.align.aligned_pair import Alignment
 from stereotruth.align.refine import refine
 from stereotruth.align.refine_report import write_refinement
 from stereotruth.align.tie_equations import write_equations
-from stereotruth.core.config.labels import Rectify
+from stereotruth.core.config.configuration import Rectify
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 from stereotruth.core.products.provenance import checksums, describe, digest

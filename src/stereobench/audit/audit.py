@@ -27,10 +27,10 @@ import numpy as np
 from stereotruth.core.config.methods import Audit, AuditLimits
 from stereotruth.core.job import progress
 from stereotruth.core.products.files import atomic_file, atomic_folder, write_table
-from stereotruth.core.products.finished_pieces import Ledger
-from stereotruth.core.products.inputs import marks, refuse_replaced
+from stereotruth.core.products.making import marks, refuse_replaced
 from stereotruth.core.products.provenance import digest, file_sha256
 from stereotruth.core.products.rasters import read_image
+from stereotruth.core.products.resumable_grids import Ledger
 from stereotruth.pages.page import way
 from stereotruth.tiles.split_names import SPLITS
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset

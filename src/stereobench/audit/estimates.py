@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from stereotruth.core.numerics.robust import (
+from stereotruth.core.numerics.statistics import (
     TUKEY,
     biweight,
     median_and_nmad,

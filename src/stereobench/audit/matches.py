@@ -29,7 +29,7 @@ from stereotruth.align.least_squares_matching import (
     weighted_mean,
 )
 from stereotruth.core.kernels import inner, kernel
-from stereotruth.core.numerics.b_spline import cubic_slopes, cubic_weights
+from stereotruth.core.numerics.interpolation import cubic_slopes, cubic_weights
 from stereotruth.tiles import sift_matches
 
 Floats = NDArray[np.float64]

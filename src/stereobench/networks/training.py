@@ -28,7 +28,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import progress
-from stereotruth.core.products.locks import exclusive
+from stereotruth.core.products.making import exclusive
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from .inference import choose_device, mixed, padding, precision_of

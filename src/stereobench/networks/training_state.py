@@ -20,7 +20,7 @@ from torch import nn
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import atomic_file, write_table
-from stereotruth.core.products.inputs import Marks, marks, refuse_replaced
+from stereotruth.core.products.making import Marks, marks, refuse_replaced
 from stereotruth.core.products.provenance import digest, file_sha256
 from stereotruth.core.products.rasters import read_image
 from stereotruth.tiles.stereo_dataset import StereoDataset

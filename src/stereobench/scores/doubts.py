@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereotruth.core.products.raster_values import OFTEN
+from stereotruth.core.products.rasters import OFTEN
 
 TURNED = 0.5  # EPE of −d to that of d, below which the sign is in doubt
 OUTSIDE_SHARE = 0.01  # of the values

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.names import plain_name
+from stereotruth.core.products.files import plain_name
 from stereotruth.core.products.rasters import read_disparity
 from stereotruth.tiles.stereo_dataset import Pair
 

@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 from stereotruth.core.errors import InputError, without_secrets
 from stereotruth.core.job import progress
 from stereotruth.core.products.files import atomic_folder, link
-from stereotruth.core.products.finished_pieces import Ledger
-from stereotruth.core.products.inputs import marks, refuse_replaced
+from stereotruth.core.products.making import marks, refuse_replaced
 from stereotruth.core.products.provenance import digest, file_sha256
 from stereotruth.core.products.rasters import image_shape, read_image, write_disparity
+from stereotruth.core.products.resumable_grids import Ledger
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
 from ..methods.kinds import FOLDER, MOVED, TOLD

@@ -25,7 +25,7 @@ import numpy as np
 
 from stereotruth.core.errors import InputError, in_number
 from stereotruth.core.job import progress
-from stereotruth.core.numerics.error_sums import ErrorSum
+from stereotruth.core.numerics.statistics import ErrorSum
 from stereotruth.core.products.files import atomic_folder, write_table
 from stereotruth.core.products.rasters import read_image
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset

@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.files import atomic_folder
-from stereotruth.core.products.names import plain_name
+from stereotruth.core.products.files import atomic_folder, plain_name
 from stereotruth.core.products.provenance import file_sha256
 
 from .prediction_files import UNCERTAINTY, read_record

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.robust import TUKEY, robust_sigma, tukey_weights
+from ..core.numerics.statistics import TUKEY, robust_sigma, tukey_weights
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from ..sensor.line_correction import LineCorrection

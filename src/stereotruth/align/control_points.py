@@ -25,12 +25,10 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from ..core.dates import epoch_year
 from ..core.errors import InputError
-from ..core.numerics.decimal_numbers import decimal_number
-from ..core.numerics.degrees import continuous
+from ..core.numerics.geometry import continuous
 from ..core.products.files import of_text
-from ..core.tables import Table
+from ..core.tables import Table, decimal_number, epoch_year
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
 
 Floats = NDArray[np.float64]

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from ..core.numerics.degrees import metres_per_degree
-from ..core.numerics.robust import TO_SIGMA
+from ..core.numerics.geometry import metres_per_degree
+from ..core.numerics.statistics import TO_SIGMA
 from ..sensor.image_reader import Source
 from ..sensor.rpc import SensorModel
 from .roof_edges import RoofEdges

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.robust import median_and_nmad
+from ..core.numerics.statistics import median_and_nmad
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

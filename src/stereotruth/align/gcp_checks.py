@@ -14,8 +14,8 @@ from pyproj.exceptions import ProjError
 from rasterio.errors import RasterioError
 
 from ..core.errors import InputError, in_number
-from ..core.numerics.degrees import metres_per_degree, turn
-from ..core.products.ungeoreferenced import open_raster
+from ..core.numerics.geometry import metres_per_degree, turn
+from ..core.products.rasters import open_raster
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import read_rpc, rpc_file
 from .control_points import ControlPoints, TooFewPoints

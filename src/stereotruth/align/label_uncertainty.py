@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.kernels import inner, kernel
-from ..core.numerics.bilinear import between_four
+from ..core.numerics.interpolation import between_four
 from ..epipolar.model import EpipolarModel
 from .aligned_pair import Alignment
 

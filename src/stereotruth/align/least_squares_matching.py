@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
-from ..core.numerics.cubic_convolution import SIX_POINT_RADIUS, six_point_weights
-from ..core.numerics.robust import TUKEY, biweight, robust_sigma
+from ..core.numerics.interpolation import SIX_POINT_RADIUS, six_point_weights
+from ..core.numerics.statistics import TUKEY, biweight, robust_sigma
 from ..epipolar.resampling import sample
 
 Floats = NDArray[np.float64]

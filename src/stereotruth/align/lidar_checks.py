@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, ndtri, stdtrit
 
-from ..core.numerics.degrees import metres_per_degree
-from ..core.numerics.robust import robust_sigma
+from ..core.numerics.geometry import metres_per_degree
+from ..core.numerics.statistics import robust_sigma
 from ..lidar.lattice import PER_M
 from ..lidar.point_store import PointStore, query_points
 from ..sensor.rpc import SensorModel

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
 from ..core.errors import InputError
-from ..core.numerics.hull import corners_of_hull
-from ..core.products.ungeoreferenced import open_raster
+from ..core.numerics.geometry import corners_of_hull
+from ..core.products.rasters import open_raster
 from ..lidar.footprint import Footprint
 from ..sensor.pair_geometry import find_overlap, find_rotation
 from ..sensor.rpc import SensorModel

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import metres_per_degree
+from ..core.numerics.geometry import metres_per_degree
 from ..sensor.rpc import SensorModel
 from .aligned_pair import ViewFit
 from .equations import PlanObservation

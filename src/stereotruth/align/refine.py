@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from ..core.config.labels import Rectify
+from ..core.config.configuration import Rectify
 from ..core.errors import InputError
-from ..core.numerics.robust import robust_sigma
+from ..core.numerics.statistics import robust_sigma
 from ..lidar.point_store import PointStore, open_stores
 from ..sensor.image_reader import Source, open_pair
 from .adjustment import (

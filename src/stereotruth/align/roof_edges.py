@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from ..core.numerics.degrees import metres_per_degree
+from ..core.numerics.geometry import metres_per_degree
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import exact_metres_per_degree
+from ..core.numerics.geometry import exact_metres_per_degree
 from ..epipolar.model import EpipolarModel
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, cell_key
 from ..lidar.point_store import SQUARES

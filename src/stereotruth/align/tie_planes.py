@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inner, kernel
-from ..core.numerics.robust import TUKEY, biweight, robust_sigma
+from ..core.numerics.statistics import TUKEY, biweight, robust_sigma
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

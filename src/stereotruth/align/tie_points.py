@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.cubic_convolution import SIX_POINT_RADIUS
-from ..core.numerics.robust import median_and_nmad, robust_sigma
+from ..core.numerics.interpolation import SIX_POINT_RADIUS
+from ..core.numerics.statistics import median_and_nmad, robust_sigma
 from ..epipolar.resampling import ANTIALIAS
 from ..sensor.image_reader import Source
 from ..sensor.rpc import SensorModel

@@ -32,9 +32,8 @@ from .config.section import (
     check,
     name_of,
 )
-from .dates import acquisition_time, epoch_year
 from .errors import InputError
-from .tables import Mistakes, Table, require_unique
+from .tables import Mistakes, Table, acquisition_time, epoch_year, require_unique
 
 MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
 LIDAR_SUFFIXES = (".las", ".laz")

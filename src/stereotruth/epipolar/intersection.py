@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inner, kernel
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 from ..sensor.rpc import project_point
 from .model import EpipolarModel
 from .spline_kernels import inverse_point

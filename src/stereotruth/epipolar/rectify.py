@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.job import block_progress
-from ..core.numerics.cubic_convolution import SIX_POINT_RADIUS
+from ..core.numerics.interpolation import SIX_POINT_RADIUS
 from ..core.products.grids import Layer, Strip, blocks
 from ..core.products.provenance import digest, file_sha256, source_digest
 from ..core.products.resumable_grids import BlockStore, resumable_grid

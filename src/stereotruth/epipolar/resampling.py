@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
-from ..core.numerics.cubic_convolution import (
+from ..core.numerics.interpolation import (
     SIX_POINT_RADIUS,
     six_point_weights,
     six_point_weights_of_row,

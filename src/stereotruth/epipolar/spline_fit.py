@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.b_spline import cubic_weights
+from ..core.numerics.interpolation import cubic_weights
 from ..sensor.virtual_points import Points
 from .model import ImageModel
 from .spline_kernels import forward_with_slopes

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
-from ..core.numerics.b_spline import cubic_slopes, cubic_weights
+from ..core.numerics.interpolation import cubic_slopes, cubic_weights
 from ..sensor.rpc import project_block
 
 Floats = NDArray[np.float64]

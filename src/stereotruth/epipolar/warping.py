@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
-from ..core.numerics.cubic_convolution import four_point_value
+from ..core.numerics.interpolation import four_point_value
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
-from ..core.numerics.cubic_convolution import four_point_weights
+from ..core.numerics.interpolation import four_point_weights
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

@@ -42,7 +42,7 @@ from ..align.site_fit import rpc_prior
 from ..align.site_line_corrections import SiteLines
 from ..align.tie_equations import read_equations
 from ..core.errors import InputError
-from ..core.numerics.bilinear import between_four
+from ..core.numerics.interpolation import between_four
 from ..core.products.files import atomic_file, sealed
 from ..core.products.grids import blocks, require_complete
 from ..epipolar.model import EpipolarModel

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..core.numerics.error_sums import ErrorSum
+from ..core.numerics.statistics import ErrorSum
 from ..core.products.files import read_table, write_table
 from ..core.products.grids import require_complete
 from ..core.products.rasters import read_tile

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.job import progress
-from ..core.numerics.error_sums import LIMITS, Calibration, ErrorSum
+from ..core.numerics.statistics import LIMITS, Calibration, ErrorSum
 from ..core.products.files import write_json, write_table
 from ..core.products.grids import blocks, open_grid
 from ..core.products.rasters import read_tile

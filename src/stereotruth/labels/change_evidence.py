@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.box_max import box_max
+from ..core.numerics.windows import box_max
 from ..epipolar.surface_windows import (
     alike_correlation,
     apart_from_steps,

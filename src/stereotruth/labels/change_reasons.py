@@ -24,8 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.box_max import box_max
-from ..core.numerics.summed_area import window_sums
+from ..core.numerics.windows import box_max, window_sums
 from ..core.status import Reason, Status
 from ..lidar.point_store import VEGETATION_CLASSES, WATER_CLASS
 from .change_evidence import WINDOW_PX

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
-from ..core.numerics.box_max import box_max
-from ..core.numerics.summed_area import window_sums
+from ..core.numerics.windows import box_max, window_sums
 from ..core.status import Status, is_labelled
 from ..lidar.lattice import LATTICE_M
 from ..lidar.point_store import WATER_CLASS

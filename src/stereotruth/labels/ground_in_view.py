@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
-from ..core.numerics.box_max import box_max
+from ..core.numerics.windows import box_max
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..lidar.smooth_maps import LocalProjection
 from ..surface.region import SQUARE_BITS, Region

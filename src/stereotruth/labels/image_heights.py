@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from ..align.aligned_pair import ViewFit
 from ..core.errors import InputError
 from ..core.job import progress
-from ..core.numerics.box_max import box_max
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
+from ..core.numerics.windows import box_max
 from ..core.products.grids import Layer, atomic_store, blocks, create_grid
 from ..core.products.provenance import digest
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M

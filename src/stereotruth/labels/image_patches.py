@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.summed_area import window_sums
+from ..core.numerics.windows import window_sums
 from ..sensor.image_detail import detail
 
 USABLE, MASKED = 1, 2  # bits

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.labels import LabelSettings
+from ..core.config.configuration import LabelSettings
 from ..core.products.grids import Layer
 from ..core.status import Reason, Status, is_labelled, statuses_of
 from .pair_window import PairWindow, WindowLabels

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.hull import corners_of_hull
+from ..core.numerics.geometry import corners_of_hull
 from ..epipolar.model import EpipolarModel
 from ..lidar.footprint import CELL_DEG, Footprint
 from ..lidar.lattice import cell_key

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.labels import LabelSettings
+from ..core.config.configuration import LabelSettings
 from ..core.status import Status
 from ..lidar.lattice import PER_DEG
 from .pair_window import PairWindow, WindowLabels

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.hull import corners_of_hull
+from ..core.numerics.geometry import corners_of_hull
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG
 from ..lidar.point_store import PointStore
 from .rays import Rays

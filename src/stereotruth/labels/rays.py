@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 from ..lidar.lattice import LATTICE_DEG
 from ..surface.scale import GROUND_CELL_PX
 from .view_geometry import ViewGeometry

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from ..align.aligned_pair import Alignment
 from ..align.label_uncertainty import LabelUncertainty
 from ..align.strip_uncertainty import with_strips
-from ..core.config.labels import LabelSettings
-from ..core.dates import acquisition_time
+from ..core.config.configuration import LabelSettings
 from ..core.products.grids import require_complete
 from ..core.products.provenance import digest
 from ..core.status import Status, statuses_of
+from ..core.tables import acquisition_time
 from ..epipolar.image_noise import NoiseCurve, pair_noise
 from ..epipolar.model import EpipolarModel
 from ..lidar.density import points_per_m2

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
-from ..core.numerics.box_max import box_max
+from ..core.numerics.windows import box_max
 from ..epipolar.surface_windows import apart_from_steps, correlations, surface_mean, surface_means
 from ..epipolar.warping import values_in_row
 from ..epipolar.window_sums import BLOCK, Runs, wanted_runs

@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.box_max import box_max
-from ..core.numerics.summed_area import summed_area
+from ..core.numerics.windows import box_max, summed_area
 from ..lidar.point_store import VEGETATION_CLASSES
 
 Bools = NDArray[np.bool_]

@@ -28,7 +28,7 @@ from shapely import Geometry
 from shapely.geometry import shape
 
 from ..core.errors import InputError
-from ..core.numerics.degrees import continuous
+from ..core.numerics.geometry import continuous
 from ..core.products.remote_files import SCHEMES, is_remote, read_bytes
 from ..core.sheets import LIDAR_SEPARATOR, LIDAR_SUFFIXES, RASTER_SUFFIXES
 from .catalogue_list import EPT

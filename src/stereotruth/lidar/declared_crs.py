@@ -17,7 +17,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
 
 from ..core.errors import InputError
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 
 VERTICAL_UNITS_KEY = 4099
 LINEAR_UNITS = {  # EPSG code: (name, metres)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
 from .point_store import SQUARES, PointStore
 

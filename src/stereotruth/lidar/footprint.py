@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
-from ..core.numerics.degrees import DEGREE_M, metres_per_degree
+from ..core.numerics.geometry import DEGREE_M, metres_per_degree
 from .lattice import CELL_BITS, LATTICE_DEG
 
 Floats = NDArray[np.float64]

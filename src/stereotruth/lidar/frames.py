@@ -38,7 +38,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from ..core.errors import InputError
-from ..core.numerics.degrees import turn
+from ..core.numerics.geometry import turn
 from .plate_motion import moved, plate_at, speed
 
 Floats = NDArray[np.float64]

@@ -11,10 +11,9 @@ from pyproj import CRS
 from rasterio.windows import Window
 
 from ..core.errors import InputError
-from ..core.numerics.bilinear import bilinear
-from ..core.numerics.degrees import metres_per_degree
-from ..core.products.raster_values import MOST_CELLS, Fills, Quantity, Values
-from ..core.products.ungeoreferenced import open_raster
+from ..core.numerics.geometry import metres_per_degree
+from ..core.numerics.interpolation import bilinear
+from ..core.products.rasters import MOST_CELLS, Fills, Quantity, Values, open_raster
 from .declared_crs import of_raster
 
 FORMATS = ("GTX", "GTiff")

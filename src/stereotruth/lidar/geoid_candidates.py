@@ -18,7 +18,7 @@ import numpy as np
 import pyproj
 
 from ..core.errors import InputError
-from ..core.numerics.degrees import turn
+from ..core.numerics.geometry import turn
 
 MOST = 4  # candidates beside the ellipsoid
 ASSUMED = "ellipsoidal (assumed)"  # how stores say that nothing is declared

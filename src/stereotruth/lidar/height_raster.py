@@ -25,10 +25,9 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from ..core.errors import InputError
-from ..core.numerics.bilinear import bilinear
-from ..core.numerics.degrees import exact_metres_per_degree, turn
-from ..core.products.raster_values import HEIGHT, Fills, Quantity, Values
-from ..core.products.ungeoreferenced import open_raster
+from ..core.numerics.geometry import exact_metres_per_degree, turn
+from ..core.numerics.interpolation import bilinear
+from ..core.products.rasters import HEIGHT, Fills, Quantity, Values, open_raster
 from .declared_crs import LidarCRS, of_raster
 from .frames import Epochs
 from .geokeys import epoch_of

@@ -24,9 +24,8 @@ from rasterio.errors import RasterioError
 
 from ..core.errors import InputError
 from ..core.products.file_parts import open_stream
-from ..core.products.raster_values import HEIGHT, MOST_CELLS, Fills, Values, refuse_bands
+from ..core.products.rasters import HEIGHT, MOST_CELLS, Fills, Values, open_raster, refuse_bands
 from ..core.products.remote_files import url_of
-from ..core.products.ungeoreferenced import open_raster
 from .height_raster import refuse_grid, system_of
 
 FORMATS = ("GTiff",)

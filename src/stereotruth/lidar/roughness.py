@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import metres_per_degree
+from ..core.numerics.geometry import metres_per_degree
 from .lattice import CELL_BITS, LATTICE_DEG
 from .point_store import Points, PointStore, query_points
 

@@ -18,7 +18,7 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 from .gps_times import day_of
 from .lattice import CELL_BITS, LATTICE_DEG, PER_DEG
 from .point_store import SQUARES, Points, PointStore

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.numerics.degrees import exact_metres_per_degree
+from ..core.numerics.geometry import exact_metres_per_degree
 from ..core.products.files import atomic_folder, sealed
 from .cell_sort import RUN_WORDS, SCRATCH_POINTS, SortedRuns
 from .ingest import _bounds

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import exact_metres_per_degree
-from ..core.numerics.robust import TUKEY, robust_sigma, tukey_weights
+from ..core.numerics.geometry import exact_metres_per_degree
+from ..core.numerics.statistics import TUKEY, robust_sigma, tukey_weights
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
 from .point_store import Points
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 from ..core.products.remote_files import url_of
 from .footprint import Footprint
 from .frames import Epochs

@@ -42,7 +42,7 @@ from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
 from ..core.errors import InputError
-from ..core.numerics.degrees import continuous, turn
+from ..core.numerics.geometry import continuous, turn
 from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, degrees_of, resolve
 from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
 from .smooth_maps import PatchedTransform

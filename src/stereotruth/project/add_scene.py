@@ -2,32 +2,154 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rasterio.errors import RasterioError
 
 from ..align.control_points import ControlPoints, read_gcps
-from ..align.gcp_checks import fit_exchanged, misfits_of_sides
+from ..align.gcp_checks import fit_exchanged, misfits_of_sides, open_view
 from ..core import sheets
 from ..core.errors import InputError
-from ..core.products.files import atomic_file
+from ..core.products.files import atomic_file, files_below
+from ..core.products.rasters import open_raster
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from ..lidar.catalogue_list import is_catalogue, write_list
 from ..lidar.overlap_check import apart, refuse_apart
+from ..sensor.rpc import SensorModel
+from ..sensor.rpc_files import rpc_file
 from .check_lidar import check_lidar
 from .check_scene import boxes_of, ground_of
-from .check_tiles import Nodes, check_frame
-from .deliveries import Image, find_pair
+from .expected import Nodes, check_frame
 from .findings import Findings, Level
 from .list_tiles import list_tiles, margin_of
+from .new_project import append_row, city_row
 from .project import configured, sheet, with_stand_ins
 
-SPLITS = {"training": 6, "validation": 1, "testing": 3}  # weights of a new city
+SUFFIXES = {".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img"}
+# Names of suppliers (GaoFen-7, ZY-3, Cartosat, ALOS PRISM) for the views along the track, and the
+# plain words.
+VIEWS = (
+    ("left", re.compile(r"(?<![A-Za-z])(BWD|BACKWARD|LEFT)(?![A-Za-z])", re.IGNORECASE)),
+    ("right", re.compile(r"(?<![A-Za-z])(FWD|FORWARD|RIGHT)(?![A-Za-z])", re.IGNORECASE)),
+)
+# What lies beside the images that are wanted: bands of colour, browse images.
+OTHERS = re.compile(
+    r"(?<![A-Za-z])(MUX|MSS?|MULTI|BROWSE|THUMB\w*|QUICKLOOK|PREVIEW|ICON)(?![A-Za-z])",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image with a usable RPC; ``view`` is what is said of it: left, right, or nothing."""
+
+    path: Path
+    view: str
+    sensor: SensorModel
+    size: tuple[int, int]
+
+
+def _view(file: Path) -> str:
+    return next((view for view, words in VIEWS if words.search(file.name)), "")
+
+
+def find_pair(given: Sequence[Path]) -> tuple[tuple[Image, Image], list[str]]:
+    """The two images of a delivery's folder, or those that are named; and remarks.
+
+    Left first where the names of the files say it, or who names them one by one. Raises
+    InputError, naming what there is, if there are not two, or one has no RPC that can be read.
+    """
+    given = [Path(path) for path in given]
+    for path in given:
+        if not path.exists():
+            raise InputError("no such file or folder", file=path, remedy="correct the path")
+    if len(given) == 2 and all(path.is_file() for path in given):
+        files, lines = given, []
+    elif all(path.is_dir() for path in given):
+        files, lines = _in_folders(given)
+    else:
+        raise InputError(
+            "is not two images, nor a folder",
+            file=given[0],
+            remedy="name the delivery's folder (or both folders), or the left and right image",
+        )
+    images = [_open(file) for file in files]
+    if {image.view for image in images} == {"left", "right"}:
+        images.sort(key=lambda image: image.view)
+    elif files == given:  # named one by one: left, right
+        images = [replace(image, view=view) for image, view in zip(images, ("left", "right"))]
+    for image in images:
+        source = rpc_file(image.path)
+        told = "its own metadata" if source == image.path else source.name
+        lines.append(f"{image.path.name}: {image.size[0]} x {image.size[1]} px, RPC from {told}")
+    return (images[0], images[1]), lines
+
+
+def _open(file: Path) -> Image:
+    sensor, size = open_view(_view(file) or "first", file, "")
+    return Image(file, _view(file), sensor, size)
+
+
+def _in_folders(folders: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """The files of the pair below folders, and remarks on those that were passed over."""
+    every = sorted(file for folder in folders for file in files_below(folder) if file.is_file())
+    files = [file for file in every if file.suffix.lower() in SUFFIXES]
+    mosaics = [file for file in every if file.suffix.lower() == ".til"]
+    for mosaic in mosaics:
+        _refuse_mosaic(mosaic)
+    wanted = [file for file in files if not OTHERS.search(file.stem)]
+    single = [file for file in wanted if _bands(file) == 1]
+    if len(single) >= 2:
+        wanted = single
+    named = {view: [file for file in wanted if _view(file) == view] for view, _ in VIEWS}
+    if all(len(found) == 1 for found in named.values()):
+        wanted = [named["left"][0], named["right"][0]]
+    lines = []
+    if passed := [file.name for file in files if file not in wanted]:
+        lines.append(f"passed over: {', '.join(passed[:6])}" + " …" * (len(passed) > 6))
+    if len(wanted) != 2:
+        there = ", ".join(str(file) for file in wanted[:8]) or "none"
+        raise InputError(
+            f"{len(wanted)} images that may be of the pair: {there}",
+            file=folders[0],
+            remedy="name the two: stereotruth scene add LEFT RIGHT --lidar …",
+        )
+    return wanted, lines
+
+
+def _bands(file: Path) -> int:
+    """Number of bands; 0 of a file that is no image of a readable format."""
+    try:
+        with open_raster(file) as dataset:
+            return dataset.count
+    except RasterioError:
+        return 0
+
+
+def _refuse_mosaic(mosaic: Path) -> None:
+    """Refuse a WorldView TIL of several files: formats that point at others are not read."""
+    text = mosaic.read_text(encoding="utf-8", errors="replace")
+    parts = re.findall(r'filename\s*=\s*"([^"]+)"', text, flags=re.IGNORECASE)
+    if len(parts) > 1:
+        raise InputError(
+            f"an image in {len(parts)} files ({parts[0]} …); a pair has one file a view",
+            file=mosaic,
+            remedy=f"put them together, gdal_translate {mosaic.name} {mosaic.stem}.TIF, keep "
+            f"{mosaic.stem}.RPB beside it, and move the parts and the TIL away",
+        )
+    part = mosaic.with_name(parts[0]) if parts else mosaic
+    rpb = mosaic.with_suffix(".RPB")
+    if part.stem != mosaic.stem and rpb.is_file() and rpc_file(part) == part:
+        raise InputError(
+            f"its RPC file {rpb.name} has another name than its image {part.name}",
+            file=mosaic,
+            remedy=f"copy it: cp {rpb.name} {part.stem}.RPB",
+        )
 
 
 def add_scene(
@@ -101,12 +223,10 @@ def add_scene(
         remedy = f". Remedy: {finding.remedy}" if finding.remedy else ""
         lines.append(f"{finding.about}: {finding.text}{remedy}")
     if city not in cities:
-        made = sheets.check(
-            {"city": city, "prefix": _prefix(city, cities), **SPLITS}, sheets.City, f"city {city}"
-        )
-        append_row(towns, sheets.City, asdict(made))
+        made = sheets.check(city_row(city, _prefix(city, cities)), sheets.City, f"city {city}")
+        append_row(towns, asdict(made))
         lines.append(f"{towns}: city {city}, tiles named {made.prefix}_…, split 6 : 1 : 3")
-    append_row(rows, sheets.Scene, cells)
+    append_row(rows, cells)
     lines.append(f"{rows}: scene {name} of {city}. Next: stereotruth check {name}")
     return lines
 
@@ -246,17 +366,3 @@ def remove_scene(name: str, configfiles: Sequence[Path] | None = None) -> str:
 def _cell(line: str, column: int) -> str:
     cells = line.rstrip("\r\n").split("\t")
     return cells[column].strip() if column < len(cells) else ""
-
-
-def append_row(file: Path, kind: type, cells: dict[str, object]) -> None:
-    """One more line of a sheet, in the order of its own header."""
-    text = file.read_text(encoding="utf-8-sig")
-    header = next(
-        (line.split("\t") for line in text.splitlines() if line and not line.startswith("#")),
-        [field.name for field in fields(kind)],
-    )
-    row = {column.strip(): cells.get(column.strip(), "") for column in header}
-    with file.open("a", newline="", encoding="utf-8") as stream:
-        if text and not text.endswith("\n"):
-            stream.write("\n")
-        csv.writer(stream, delimiter="\t", lineterminator="\n").writerow(row.values())

@@ -8,18 +8,18 @@ from time import monotonic
 
 from stereocities.cities import city_of, file_of
 
-from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.sheets import Scene
 from ..lidar.frames import Epoch
 from ..tiles.windows import cell_step
-from .check_scene import Looked, SceneFacts, check_scene
-from .epochs import epoch_of_city
+from .check_scene import Looked, check_scene
+from .expected import check_resources, duration
 from .findings import Findings, Level
 from .project import (
     adjusted_scenes,
     check_fixed,
     configured,
+    epoch_of_city,
     is_synthetic,
     names_in_pair,
     read_images,
@@ -27,8 +27,6 @@ from .project import (
     require_scenes,
     sheet,
 )
-from .resources import check_resources
-from .run_workflow import duration
 from .site import check_images, check_links, scene_pairs
 
 TIMED = 3  # scenes by which the time of the others is known
@@ -117,8 +115,10 @@ def check_project(
         for town in towns:
             check_links(town, images, scene_pairs(town, every_scene, images), of_images)
         every.insert(1, of_images)
-    every.append(_run(facts, settings))
-    return every
+    run = Findings("run")
+    with run.of("resources"):
+        check_resources([fact for fact in facts if fact.pixels], run)
+    return [*every, run]
 
 
 def _tell_time(tell: Callable[[str], object], scene_s: float, left: int) -> None:
@@ -146,13 +146,6 @@ def _check_synthetic(scene: Scene, found: Findings) -> None:
                     remedy=f"put it back, or correct its path in {file_of(city.name)}",
                 )
         found.say("input", Level.FACT, f"twin of {city.twin.file}: {words}")
-
-
-def _run(facts: Sequence[SceneFacts], settings: Configuration) -> Findings:
-    found = Findings("run")
-    with found.of("resources"):
-        check_resources([fact for fact in facts if fact.pixels], settings, found)
-    return found
 
 
 def _counted(scenes: dict[str, Scene]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..align.gcp_checks import open_view
 from ..align.pair_ground import footprint_of
 from ..core.config.configuration import Configuration
 from ..core.errors import InputError
-from ..core.products.ungeoreferenced import open_raster
+from ..core.products.rasters import open_raster
 from ..core.sheets import Scene
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
@@ -29,9 +29,8 @@ from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..lidar.overlap_check import FAR, Box, apart, refuse_apart
 from ..lidar.survey import SurveyedFile
 from ..sensor.image_reader import MAX_PIXELS, Source, bands_of
-from .check_lidar import check_lidar
-from .check_strips import check_strips
-from .check_tiles import Nodes, check_frame, check_labels, pixel_m2
+from .check_lidar import check_lidar, check_strips
+from .expected import Nodes, SceneFacts, check_frame, check_labels, pixel_m2
 from .findings import Finding, Findings, Level
 from .project import is_synthetic, lidar_of
 
@@ -43,17 +42,6 @@ PLACES = 8  # along each side of a larger one that are looked at
 Looked = dict[tuple[str, str], Findings]  # of images, by file and bands
 
 log = logging.getLogger("stereotruth")
-
-
-@dataclass
-class SceneFacts:
-    """What the run's time and disk follow from."""
-
-    scene: str
-    pixels: int = 0  # of the epipolar grid
-    points: int = 0  # of the LiDAR
-    lidar_files: int = 0
-    covered: float = 1.0  # share of the grid
 
 
 def check_scene(

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from ..core.errors import InputError, told_by_system
 from ..core.tables import SheetError
@@ -85,3 +89,69 @@ class _Listener(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self.heard.append(record.getMessage())
+
+
+STYLES = {Level.FACT: "green", Level.DOUBT: "yellow", Level.ERROR: "bold red"}
+HEADINGS = ("project", "images", "run")  # of findings that are of no scene
+WIDTH = 160  # where the output is no terminal
+
+
+def said_once(every: Sequence[Findings]) -> list[tuple[str, list[Finding]]]:
+    """Headings of the table with their findings. A doubt or an error of several scenes, and a fact
+    of all, stands once, under their number and before the scenes; its ``scene`` names them unless
+    these are all."""
+    of: dict[Finding, list[str]] = {}
+    for findings in every:
+        for found in findings:
+            of.setdefault(replace(found, scene=""), []).append(findings.scene)
+    scenes = [findings.scene for findings in every if findings.scene not in HEADINGS]
+    together: dict[int, list[Finding]] = {}
+    shared = set()
+    for found, names in of.items():
+        if len(names) > max(len(scenes) - 1 if found.level is Level.FACT else 1, 1):
+            shared.add(found)
+            named = replace(found, scene=", ".join(names) if len(names) < len(scenes) else "")
+            together.setdefault(len(names), []).append(named)
+    parts: list[tuple[str, list[Finding]]] = []
+    for findings in every:
+        if scenes and findings.scene == scenes[0]:
+            for count, found in sorted(together.items(), reverse=True):
+                parts.append((f"{'all ' * (count == len(scenes))}{count} scenes", found))
+        own = [found for found in findings if replace(found, scene="") not in shared]
+        parts.append((findings.scene, own))
+    return parts
+
+
+def show(every: Sequence[Findings], console: Console | None = None) -> bool:
+    """Print one table, problems with their remedies below them; whether a run would fail."""
+    console = console or Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(width=WIDTH, highlight=False, file=console.file)
+    table = Table(box=None, pad_edge=False, show_edge=False, header_style="bold")
+    for heading in ("scene", "about", "", "finding"):
+        table.add_column(heading, overflow="fold", no_wrap=heading in ("scene", ""))
+    counts = dict.fromkeys((Level.ERROR, Level.DOUBT, Level.FACT), 0)
+    for scene, findings in said_once(every):
+        for k, found in enumerate(findings):
+            counts[found.level] += 1
+            style = STYLES[found.level]
+            text = escape(found.text)
+            if found.remedy:
+                text += f"\n[dim]Remedy:[/dim] {escape(found.remedy)}"
+            if "," in found.scene:
+                text += f"\n[dim]Scenes:[/dim] {escape(found.scene)}"
+            mark = f"[{style}]{found.level.value}[/{style}]"
+            table.add_row(escape(scene) if k == 0 else "", found.about, mark, text)
+    console.print(table)
+    failed = any(findings.failed for findings in every)
+    verdict = "a run would fail" if failed else "a run can begin"
+    numbers = ", ".join(
+        f"{n} {level.value}{'s' * (n != 1)}"
+        for level, n in counts.items()
+        if level is not Level.FACT
+    )
+    console.print(
+        f"{numbers}: {verdict}",
+        style="bold red" if failed else "bold green",
+    )
+    return failed

@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from ..align.control_points import COLUMNS, read_gcps
-from ..core.dates import epoch_year
 from ..core.errors import InputError
-from ..core.numerics.degrees import metres_per_degree, turn
+from ..core.numerics.geometry import metres_per_degree, turn
 from ..core.products.files import as_text
-from ..core.tables import Lines, Table
+from ..core.tables import Lines, Table, epoch_year
 from ..lidar.declared_crs import parse_crs
 from ..lidar.frames import WGS84_NAME, Epoch, Epochs
 from ..lidar.height_raster import Floats, HeightRaster

@@ -13,8 +13,7 @@ from pyproj.exceptions import CRSError
 
 from ..align.pair_ground import footprint_of
 from ..core import sheets
-from ..core.config.configuration import Configuration
-from ..core.config.labels import Ingest
+from ..core.config.configuration import Configuration, Ingest
 from ..core.errors import InputError, in_number, without_secrets
 from ..core.products.remote_files import bring_image, is_remote, state_of
 from ..lidar.catalogue import Cover, Tile, cover_of, read_catalogue, resolved

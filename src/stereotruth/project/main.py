@@ -119,10 +119,8 @@ def init(
     ] = None,
 ) -> None:
     """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
-    from .new_project import begin, with_example
-
     if twin is not None:
-        from .twin_project import DENSITY, SUN_DEG, Options, with_twin
+        from .simulated_project import DENSITY, SUN_DEG, Options, with_twin
 
         to: Path | str = folder or Path("twin")
         options = Options(crs, density or DENSITY, sun or SUN_DEG, size, rpc)
@@ -133,7 +131,14 @@ def init(
                 "--crs, --density, --sun, --size and --rpc are of a twin", remedy="add --twin FILE"
             )
         to = example if folder is None else folder
-        next_step = with_example(to, example) if example else begin(to)
+        if example:
+            from .simulated_project import with_example
+
+            next_step = with_example(to, example)
+        else:
+            from .new_project import begin
+
+            next_step = begin(to)
     go = "" if Path(to) == Path() else f"cd {to}, then "
     typer.echo(f"{to}: a project. Next: {go}{next_step}")
 
@@ -288,7 +293,7 @@ def check(
 ) -> None:
     """Say in seconds what would make a run fail, how many tiles come, and the time it takes."""
     from .check import check_project
-    from .check_table import show
+    from .findings import show
 
     if show(check_project(configfile, scenes or [], partial(typer.echo, err=True))):
         raise typer.Exit(1)
@@ -324,8 +329,7 @@ def pairs(
     configfile: Configured = None,
 ) -> None:
     """List the pairs of a site, best first; with a choice, write it to the scenes sheet."""
-    from .pairs import CONVERGENCE_DEG, Choice, list_pairs
-    from .pairs_table import show_pairs
+    from .pairs import CONVERGENCE_DEG, Choice, list_pairs, show_pairs
 
     limits = (most, days, each, convergence if convergence != CONVERGENCE_DEG else None)
     choice = None
@@ -366,13 +370,13 @@ def run(
     if context.args in (["--help"], ["-h"]):
         typer.echo(context.get_help())
         raise typer.Exit
-    raise typer.Exit(run_workflow(context.args))
+    run_workflow(context.args)
 
 
 @app.command(epilog=examples("stereotruth targets", "stereotruth run report"))
 def targets(configfile: Configured = None) -> None:
     """List what a run can make, one line each, and the names to put in."""
-    from .targets import list_targets
+    from .run_workflow import list_targets
 
     for line in list_targets(configfile):
         typer.echo(line)
@@ -392,7 +396,7 @@ def profile(
     ] = None,
 ) -> None:
     """List the profiles of the package, or copy one here, to set account and partition in it."""
-    from .profiles import copy_profile, list_profiles
+    from .new_project import copy_profile, list_profiles
 
     for line in [copy_profile(name, folder)] if name else list_profiles():
         typer.echo(line)

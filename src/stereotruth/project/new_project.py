@@ -1,8 +1,11 @@
-"""A project of the user's own: a folder with configuration, sheets and a place for GCPs."""
+"""A project of the user's own: a folder with configuration, sheets, and copies of profiles."""
 
 from __future__ import annotations
 
+import csv
 import re
+import shutil
+from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
 
@@ -66,16 +69,48 @@ def begin(folder: str | Path) -> str:
     return "stereotruth scene add DELIVERY --lidar FOLDER"
 
 
-def with_example(folder: str | Path, name: str) -> str:
-    """A new project with a small synthetic city, ``demo`` or ``site``; returns the next step.
+def append_row(file: Path, cells: Mapping[str, object]) -> None:
+    """One more line of a sheet, in the order of its header."""
+    text = file.read_text(encoding="utf-8-sig")
+    header = next(line for line in text.splitlines() if line and not line.startswith("#"))
+    row = [cells.get(column.strip(), "") for column in header.split("\t")]
+    with file.open("a", newline="", encoding="utf-8") as stream:
+        if not text.endswith("\n"):
+            stream.write("\n")
+        csv.writer(stream, delimiter="\t", lineterminator="\n").writerow(row)
 
-    Images, LiDAR and control points are made here. Raises InputError for another name.
+
+def city_row(name: str, prefix: str) -> dict[str, object]:
+    """The row of a new city, whose tiles are split 6 : 1 : 3."""
+    return {"city": name, "prefix": prefix, "training": 6, "validation": 1, "testing": 3}
+
+
+SHIPPED = {
+    "default": "how every run treats what is made and what is due; taken without being named",
+    "slurm": "each step as a job of a SLURM cluster",
+    "s3": "products in a bucket",
+}
+
+
+def list_profiles() -> list[str]:
+    """A line for each profile, and what to do with them."""
+    width = max(map(len, SHIPPED))
+    return [
+        *(f"{name:{width}}  {meaning}" for name, meaning in SHIPPED.items()),
+        "stereotruth run --profile NAME takes one; stereotruth profile NAME copies it here to edit",
+    ]
+
+
+def copy_profile(name: str, folder: Path | None = None) -> str:
+    """Write a copy of a profile to ``folder`` (its name); returns what to do next.
+
+    Raises InputError for a profile that the package has not, and if the folder is there.
     """
-    from .example_city import EXAMPLES
-
-    if name not in EXAMPLES:
-        raise InputError(
-            f"no example {name!r}", remedy=f"take one of {', '.join(EXAMPLES)} after --example"
-        )
-    begin(folder)
-    return EXAMPLES[name](Path(folder))
+    if name not in SHIPPED:
+        raise InputError(f"no profile {name!r}", remedy=f"take one of {', '.join(SHIPPED)}")
+    folder = folder or Path(name)
+    if folder.exists():
+        raise InputError("is there already", file=folder, remedy="name a folder that is not there")
+    shutil.copytree(FILES / "profiles" / name, folder)
+    (file,) = folder.glob("config*.yaml")
+    return f"{file}: set what differs at your site. Next: stereotruth run --profile {folder} -n"

@@ -9,6 +9,10 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
 from ..core import sheets
 from ..core.config.configuration import Configuration
 from ..core.errors import InputError
@@ -18,7 +22,8 @@ from ..sensor.linked_images import Links, Names, new_links
 from ..sensor.pair_light import DIACHRONIC_DAYS
 from ..sensor.pair_quality import USUAL_ROUGHNESS_M, RatedPair, rate
 from ..sensor.site_pairs import SitePair
-from .add_scene import append_row
+from .findings import WIDTH
+from .new_project import append_row
 from .project import configured, names_in_pair, read_images, sheet
 from .site import images_of, scene_pairs
 
@@ -199,7 +204,7 @@ def write_pairs(
         name = _free_name(pair, scenes)
         cells = {"scene": name, "city": city, "left_image": pair.left, "right_image": pair.right}
         sheets.check(cells | here, sheets.Scene, f"scene {name}")
-        append_row(rows, sheets.Scene, cells | here)
+        append_row(rows, cells | here)
         written += 1
     return f"{rows}: {written} of {len(rated)} pairs written. Next: stereotruth check {city}"
 
@@ -309,4 +314,30 @@ def _in_words(city: str, roughness: float | None) -> str:
     return (
         f"matched follows from the ingested LiDAR, too: steps of {roughness:.1f} m between squares "
         f"of 2 m on the average, of a usual site {USUAL_ROUGHNESS_M} m"
+    )
+
+
+def show_pairs(
+    rated: Sequence[RatedPair],
+    chosen: Collection[tuple[str, str]] = (),
+    console: Console | None = None,
+) -> None:
+    """Print a line for each pair, in the order given, and what the prediction is.
+
+    ``chosen``: names of the images of pairs that are scenes.
+    """
+    console = console or Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(width=WIDTH, highlight=False, file=console.file)
+    shown = Table(box=None, pad_edge=False, show_edge=False, header_style="bold")
+    for heading in COLUMNS:
+        shown.add_column(heading, overflow="fold", no_wrap=heading != "reason")
+    for cells in table(rated, chosen):
+        shown.add_row(*map(escape, cells))
+    console.print(shown)
+    console.print(
+        f"{len(rated)} pairs, best first. bits/px: information about the height that a pixel "
+        "gives, by matched (predicted share of the pixels seen in both that semi-global matching "
+        "finds within 1 px) and m/px (height that 1 px is)",
+        style="dim",
     )

@@ -6,7 +6,9 @@ import logging
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from ..core.products.remote_files import (
     place_of,
     stand_in,
 )
+from ..core.tables import decimal_year, epoch_year
 from ..lidar.catalogue_list import (
     EPT,
     days_of_list,
@@ -38,6 +41,8 @@ from ..lidar.catalogue_list import (
     remarks_on,
     unlisted_m2,
 )
+from ..lidar.frames import DEFAULT_EPOCH, Epoch
+from ..sensor.acquisition import read_acquisition
 
 log = logging.getLogger("stereotruth")
 _PACKAGE = Path(__file__).parents[1]
@@ -464,3 +469,42 @@ def check_fixed(
                 remedy="take a scene of the sheet and the path of its alignment.json, or an image "
                 "of the images sheet and a copy of results/adjust/<city>.json",
             )
+
+
+LOOKED_AT = 10  # scenes of a city whose deliveries are looked into
+ANYWHERE = (0.0, 0.0)  # degrees: a day does not depend on the place
+
+
+def epoch_of_city(
+    city: sheets.City, scenes: Mapping[str, sheets.Scene], images: Mapping[str, sheets.Image]
+) -> Epoch:
+    """The epoch of a city; the default where neither sheet nor image tells one.
+
+    ``scenes``, ``images``: rows of the sheets, of this and of other cities.
+    """
+    if (year := epoch_year(city.epoch)) is not None:
+        return Epoch(year, "the cities sheet")
+    looked = 0
+    for scene in scenes.values():
+        if scene.city != city.city or is_synthetic(scene):
+            continue
+        days = []
+        names = names_in_pair(scene, images)
+        for name, file in zip(names, (scene.left_image, scene.right_image)):
+            day = sheets.day_of(images[name].acquired) if name else None
+            if day is None and looked < LOOKED_AT:
+                day = _delivered(file)
+            if day is not None:
+                days.append(day)
+        looked += 1
+        if days:
+            year = sum(map(decimal_year, days)) / len(days)
+            return Epoch(round(year, 3), f"the images of scene {scene.scene}")
+    return DEFAULT_EPOCH
+
+
+def _delivered(image: str) -> date | None:
+    with suppress(OSError, ValueError):
+        time = read_acquisition(image, ANYWHERE).time
+        return None if time is None else time.date()
+    return None

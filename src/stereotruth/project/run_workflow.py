@@ -1,48 +1,144 @@
-"""The workflow in this folder, by Snakemake, with a line that says how far it is."""
+"""The workflow in this folder, by Snakemake: what it can make, and a run of it."""
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
-import signal
-import subprocess
 import sys
-import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from ..core.config.methods import DATASETS
 from ..core.errors import InputError
-from .project import CONFIG, FILES, read_mapping, require_project, require_scenes
-from .targets import need_scenes, refuse_unknown
+from .project import (
+    CONFIG,
+    FILES,
+    configured,
+    names_scenes,
+    read_mapping,
+    read_scenes,
+    require_project,
+    require_scenes,
+)
+
+TARGETS = {
+    "tiles/<City>": "the benchmark tiles of a city (without a target: of all cities)",
+    "dataset": "the tiles of all cities, in the layout of the published dataset",
+    "originals": "crops of the original images with corrected RPCs (dataset.originals)",
+    "verify": "all tiles, held against the checksums of their manifests",
+    "report": "the pages of all cities; results/report/<City>/index.html that of one",
+    "evaluate": "figures from the images, and against the exact truth of synthetic cities",
+    "results/project/<City>/<scene>.zarr": "disparity, status and uncertainty of a whole scene",
+    "results/adjust/<City>.json": "corrections and residuals of images that pairs share",
+    "closure": "what the labels of three pairs of images say of each other",
+    "results/predict/<City>/<scene>/<method>_dsm.tif": "surface model of a scene by a method",
+    "score_dsm/<City>/<scene>/<method>": "that surface model, held against the LiDAR",
+    "benchmark": "the methods that each dataset names, scored and compared",
+    "benchmark/<dataset>/<method>": "the scores of one method on one dataset",
+    "submission/<dataset>/<method>": "the results of a method, as others submit them",
+    "results/train/<dataset>/<method>/training.json": "a network, trained",
+    "audit/<dataset>": "what is wrong with a stereo dataset",
+    "training_cities": "synthetic cities to train on",
+}
+
+
+def list_targets(configfiles: Sequence[Path] | None = None) -> list[str]:
+    """A line for each target, and the cities, scenes, datasets and methods to put into them."""
+    settings, _ = configured(configfiles)
+    cities, scenes = read_scenes(settings)
+    if not names_scenes(configfiles):  # the built-in cities are made with --example alone
+        cities, scenes = {}, {}
+    with_scenes = [city for city in cities if any(s.city == city for s in scenes.values())]
+    width = max(map(len, TARGETS))
+    known = {
+        "<City>": with_scenes,
+        "<scene>": list(scenes),
+        "<dataset>": [name for name, entry in settings.benchmark.datasets.items() if entry],
+        "<method>": [name for name, entry in settings.benchmark.methods.items() if entry],
+    }
+    return [f"{name:{width}}  {meaning}" for name, meaning in TARGETS.items()] + [
+        f"{name}: {', '.join(values[:12])}{' …' if len(values) > 12 else ''}"
+        for name, values in known.items()
+        if values
+    ]
+
+
+def rules() -> list[str]:
+    """Names of the workflow's rules."""
+    return [
+        name
+        for file in sorted((FILES / "workflow" / "rules").glob("*.smk"))
+        for name in re.findall(r"^rule (\w+):", file.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+
+
+# Where a path has the name of a city, of a dataset.
+STAGES = "ingest|align|refine|rectify|project|heights|export|evaluate|report|predict"
+IN_PATH = (
+    (re.compile(rf"(tiles|score_dsm|results/({STAGES}))/(?P<name>[^/]+)(/.+)?"), "city"),
+    (re.compile(r"(benchmark|audit|submission|results/train)/(?P<name>[^/]+)(/.+)?"), "dataset"),
+)
+
+
+# Targets that are made of a dataset by its name, or of built-in cities by their own.
+WITHOUT_SCENES = re.compile(
+    r"(benchmark|audit|submission|results/(train|match|training_cities))/.+|training_cities"
+)
+
+
+def need_scenes(given: Sequence[str], configfiles: Sequence[Path] | None = None) -> bool:
+    """Whether the targets of a run are made of the scenes sheet."""
+    targets = words_before_options(given)
+    if targets == ["benchmark"]:
+        settings, _ = configured(configfiles)
+        return any(settings.benchmark.datasets.get(name) for name in DATASETS)
+    return not targets or not all(map(WITHOUT_SCENES.fullmatch, targets))
+
+
+def words_before_options(given: Sequence[str]) -> list[str]:
+    """The targets among the arguments of a run."""
+    words = list(given)
+    first_option = next((k for k, word in enumerate(words) if word.startswith("-")), len(words))
+    return [word.rstrip("/") for word in words[:first_option]]
+
+
+def _names_for(word: str, configfiles: Sequence[Path] | None) -> list[str]:
+    """What a word that is no option may be: rules, or its path with each city or dataset in it.
+
+    Empty for a path of which this is not known.
+    """
+    if "/" not in word:
+        return [] if Path(word).exists() else [*rules(), "all"]
+    for pattern, kind in IN_PATH:
+        if found := pattern.fullmatch(word):
+            settings, _ = configured(configfiles)
+            datasets = [name for name, entry in settings.benchmark.datasets.items() if entry]
+            names = list(read_scenes(settings)[0]) if kind == "city" else datasets
+            start, end = found.span("name")
+            return [word[:start] + name + word[end:] for name in names]
+    return []
+
+
+def refuse_unknown(given: Sequence[str], configfiles: Sequence[Path] | None = None) -> None:
+    """Raise InputError for a target that is a typo, with what it may mean.
+
+    ``given``: arguments of a run; targets are the words before the first option. Paths without a
+    city or dataset at a known place are left to Snakemake.
+    """
+    for word in words_before_options(given):
+        names = _names_for(word, configfiles)
+        if names and word not in names:
+            close = difflib.get_close_matches(word, names, n=1)
+            remedy = f"did you mean {close[0]}?" if close else "stereotruth targets lists them"
+            raise InputError(f"{word}: no such target", remedy=remedy)
+
 
 EXAMPLE = "--example"  # the synthetic cities that come with the package
 CONFIG_OPTIONS = ("--configfile", "--configfiles")
 CORES = re.compile(r"--(cores|jobs|profile|executor)(=|$)|-[cj]")
-# Seconds of the jobs of a scene of 1200 x 1200 px with 4 million points, one core: they say what
-# share of a run a job is, until its own jobs say how fast this machine is.
-SECONDS = {
-    "simulate_image": 8,
-    "simulate_lidar": 8,
-    "ingest": 6,
-    "align": 3,
-    "refine": 12,
-    "rectify": 6,
-    "surface": 8,
-    "project": 8,
-    "export": 15,
-    "evaluate_images": 10,
-    "report_city": 15,
-    "match": 30,
-    "train": 3600,
-}
-USUAL_SECONDS = 5.0
-TRUSTED = 20.0  # seconds of jobs by which the table above counts beside the jobs that are done
-STATS = re.compile(r"^(\w+) +(\d+)$")
-FINISHED = re.compile(r"^Finished jobid: \d+ \(Rule: (\w+)\)")
-STEPS = re.compile(r"^(\d+) of (\d+) steps")
 
 
 def arguments_for(given: Sequence[str]) -> list[str]:
@@ -107,105 +203,8 @@ def config_files(arguments: Sequence[str]) -> list[Path]:
     return [file for file in found if file.is_file()]
 
 
-@dataclass
-class Progress:
-    """How far a run is, from the lines that Snakemake prints."""
-
-    begun: float = field(default_factory=time.monotonic)
-    planned: dict[str, int] = field(default_factory=dict)
-    done: dict[str, int] = field(default_factory=dict)
-    steps: tuple[int, int] = (0, 0)
-    in_table: bool = False
-
-    def read(self, line: str) -> None:
-        """Take in one line."""
-        if line.startswith("Job stats:"):
-            self.in_table, self.planned = True, {}
-        elif self.in_table and (found := STATS.match(line)):
-            rule, count = found[1], int(found[2])
-            if rule == "total":
-                self.in_table, self.steps = False, (self.steps[0], count)
-            else:
-                self.planned[rule] = count
-        elif found := FINISHED.match(line):
-            self.done[found[1]] = self.done.get(found[1], 0) + 1
-        elif found := STEPS.match(line):
-            self.steps = int(found[1]), int(found[2])
-
-    @staticmethod
-    def _weight(jobs: dict[str, int]) -> float:
-        return sum(SECONDS.get(rule, USUAL_SECONDS) * count for rule, count in jobs.items())
-
-    def seconds_left(self, now: float | None = None) -> float:
-        """By the jobs that are done, and while these are few by the table of usual seconds."""
-        done, planned = self._weight(self.done), self._weight(self.planned)
-        elapsed = (time.monotonic() if now is None else now) - self.begun
-        return max(planned - done, 0.0) * (elapsed + TRUSTED) / (done + TRUSTED)
-
-    def line(self, now: float | None = None) -> str:
-        """The status line."""
-        done, total = self.steps
-        if not total:
-            return "planning"
-        left = f", about {duration(self.seconds_left(now))} left" if done < total else ""
-        return f"{done} of {total} jobs done{left}"
-
-
-def duration(seconds: float) -> str:
-    """A time span in the words of a person."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    if seconds < 5400:
-        return f"{seconds / 60:.0f} min"
-    return f"{seconds / 3600:.1f} h"
-
-
-def watch(lines: Iterable[str], progress: Progress) -> None:
-    """Print the lines of a run, and below them its status line with time left."""
-    from rich.console import Console
-    from rich.live import Live
-    from rich.spinner import Spinner
-
-    console = Console(stderr=True, highlight=False)
-    spinner = Spinner("line", progress.line())
-    with Live(spinner, console=console, refresh_per_second=4, transient=True):
-        for line in lines:
-            line = line.rstrip("\n")
-            progress.read(line)
-            spinner.update(text=progress.line())
-            console.print(line, markup=False, soft_wrap=True)
-
-
-def follow(process: subprocess.Popen[str]) -> int:
-    """Watch a run until it ends; returns its exit status.
-
-    After Ctrl-C, which reaches Snakemake too, what its jobs say of their end is not shown.
-    """
-    is_stopped = False
-    while True:
-        try:
-            if is_stopped:
-                for _ in process.stdout or ():
-                    pass
-            else:
-                watch(process.stdout or (), Progress())
-            status = process.wait()
-            break
-        except KeyboardInterrupt:
-            if not is_stopped:
-                sys.stderr.write("Stopping the jobs that are at work …\n")
-            is_stopped = True
-    if is_stopped:
-        sys.stderr.write("Stopped. The same command carries on.\n")
-    return status
-
-
-def run_workflow(given: Sequence[str]) -> int:
-    """Run the workflow; returns Snakemake's exit status.
-
-    On a terminal its lines pass through here, with a status line below them; else this process
-    becomes Snakemake's.
-    """
+def run_workflow(given: Sequence[str]) -> None:
+    """Become a run of the workflow. Raises InputError for what Snakemake would not name."""
     arguments = arguments_for(given)
     files = config_files(arguments)
     for file in files:  # Snakemake names no file that it cannot read
@@ -215,17 +214,4 @@ def run_workflow(given: Sequence[str]) -> int:
         by_option = any(word.startswith("scenes=") for word in given)  # of --config
         if not by_option and need_scenes(given, files):
             require_scenes(files)
-    command = [sys.executable, "-m", "snakemake", *arguments]
-    if not sys.stderr.isatty() or {"--dry-run", "-n", "--dryrun"} & set(given):
-        os.execv(sys.executable, command)
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(
-        command,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-    )
-    signal.signal(signal.SIGTERM, lambda number, _: process.send_signal(number))
-    return follow(process)
+    os.execv(sys.executable, [sys.executable, "-m", "snakemake", *arguments])

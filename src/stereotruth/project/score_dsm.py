@@ -6,9 +6,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from ..core.dates import epoch_year
 from ..core.errors import InputError
 from ..core.sheets import lidar_files, store_names
+from ..core.tables import epoch_year
 from ..evaluate.surface_models.page import describe, write_verdict
 from ..evaluate.surface_models.reference import LidarReference, RasterReference
 from ..evaluate.surface_models.score import score_surface_model

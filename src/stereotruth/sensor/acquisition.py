@@ -194,7 +194,7 @@ def _of_stac(item: Mapping[str, Any]) -> Acquisition | None:
 
 def _of_tags(image: Path) -> Acquisition:
     """The tags of NITF files, and what GDAL finds of a sensor's metadata (domain IMAGERY)."""
-    from ..core.products.ungeoreferenced import open_raster
+    from ..core.products.rasters import open_raster
 
     with open_raster(image) as dataset:
         tags, imagery = dataset.tags(), dataset.tags(ns="IMAGERY")

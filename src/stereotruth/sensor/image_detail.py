@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
-from ..core.numerics.summed_area import window_sums
+from ..core.numerics.windows import window_sums
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]

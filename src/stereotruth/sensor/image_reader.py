@@ -16,10 +16,9 @@ from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
-from ..core.config.labels import Rectify
+from ..core.config.configuration import Rectify
 from ..core.errors import InputError
-from ..core.products.raster_values import MASK, Hidden, refuse_bands
-from ..core.products.ungeoreferenced import open_raster
+from ..core.products.rasters import MASK, Hidden, open_raster, refuse_bands
 from .tiff_blocks import damaged_block
 
 log = logging.getLogger("stereotruth")

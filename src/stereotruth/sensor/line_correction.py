@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.numerics.b_spline import cubic_weights
+from ..core.numerics.interpolation import cubic_weights
 
 Floats = NDArray[np.float64]
 

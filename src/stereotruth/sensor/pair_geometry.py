@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.numerics.degrees import exact_metres_per_degree
+from ..core.numerics.geometry import exact_metres_per_degree
 from .rpc import SensorModel
 from .virtual_points import frame, inside, steps
 

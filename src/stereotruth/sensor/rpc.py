@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.kernels import inlined, inner, kernel
-from ..core.numerics.degrees import continuous
+from ..core.numerics.geometry import continuous
 from .line_correction import LineCorrection, of_record, read_correction
 
 Floats = NDArray[np.float64]

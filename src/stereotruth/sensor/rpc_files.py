@@ -10,8 +10,8 @@ from typing import Any
 from rasterio.errors import RasterioError
 
 from ..core.errors import InputError
-from ..core.numerics.decimal_numbers import decimal_number
-from ..core.products.ungeoreferenced import open_raster
+from ..core.products.rasters import open_raster
+from ..core.tables import decimal_number
 from .rpc import RPC, SCALARS, VECTORS
 
 log = logging.getLogger("stereotruth")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
 from ..core.errors import InputError
-from ..core.products.ungeoreferenced import open_raster
+from ..core.products.rasters import open_raster
 from .rpc import SensorModel
 from .rpc_files import read_rpc
 

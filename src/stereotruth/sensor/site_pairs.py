@@ -16,7 +16,7 @@ from datetime import datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 from .pair_geometry import ray_upwards, view_order
 from .rpc import SensorModel
 from .sun import between_suns, shadow_shift

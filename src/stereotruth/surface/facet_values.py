@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inner, kernel
-from ..core.numerics.triangles import corner_shares, plane_slopes
+from ..core.numerics.geometry import corner_shares, plane_slopes
 from .vertices import Vertices
 
 Floats = NDArray[np.float64]

@@ -6,7 +6,7 @@ the points up to :attr:`.scale.SurfaceScale.halo_cells` around it, whatever bloc
 it, in which order and by how many workers. Blocks are small, since
 windows read them whole, and are made by groups that are wide against their halo. Finished groups
 outlive a killed job, and one more LiDAR file leaves those that it does not touch
-(:mod:`stereotruth.core.products.finished_pieces`).
+(:mod:`stereotruth.core.products.resumable_grids`).
 """
 
 from __future__ import annotations
@@ -25,11 +25,9 @@ from numpy.typing import NDArray
 from ..core.job import progress
 from ..core.kernels import kernel
 from ..core.products.files import atomic_file, atomic_folder, link, sealed
-from ..core.products.finished_pieces import Ledger
-from ..core.products.inputs import refuse_replaced
-from ..core.products.locks import FileLock
-from ..core.products.making import marks_of_inputs
+from ..core.products.making import FileLock, marks_of_inputs, refuse_replaced
 from ..core.products.provenance import describe, digest
+from ..core.products.resumable_grids import Ledger
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
 from ..lidar.overlap_check import refuse_apart

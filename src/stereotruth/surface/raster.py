@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inner, kernel
-from ..core.numerics.triangles import plane_slopes, row_span
+from ..core.numerics.geometry import plane_slopes, row_span
 from ..epipolar.window_sums import SURFACE_PX
 from ..lidar.lattice import LATTICE_M
 from .facet_values import Facets, PixelValues, interpolate, triple

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 
 PART_BITS = 5

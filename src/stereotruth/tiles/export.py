@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.labels import Export, Limits
+from ..core.config.configuration import Export, Limits
 from ..core.errors import InputError
 from ..core.job import progress
 from ..core.products.files import atomic_file, atomic_folder, growing_table, write_table

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import map_coordinates
 
-from ..core.numerics.degrees import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
-from ..core.numerics.robust import TO_SIGMA, biweight
+from ..core.numerics.statistics import TO_SIGMA, biweight
 from .label_surfaces import LabelSurface
 from .sift_matches import TileMatches
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..core.errors import InputError
-from ..core.products.files import read_table
-from ..core.products.names import path_below, plain_name, shown
+from ..core.products.files import path_below, plain_name, read_table, shown
 from .split_names import NONE, SPLITS
 
 NAMES = ("tile", "city", "scene", "split")  # columns that name something

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.degrees import for_readers
+from ..core.numerics.geometry import for_readers
 from .polynomials import evaluate, fit
 
 if TYPE_CHECKING:

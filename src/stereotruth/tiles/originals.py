@@ -31,8 +31,7 @@ from ..core.job import progress
 from ..core.products.files import atomic_folder, write_table
 from ..core.products.grids import require_complete
 from ..core.products.provenance import file_sha256
-from ..core.products.rasters import write_tiff
-from ..core.products.ungeoreferenced import open_raster
+from ..core.products.rasters import open_raster, write_tiff
 from ..sensor.rpc import RPC
 from ..sensor.rpc_files import rpc_text
 from .layer_kinds import NODATA, LayerKind

@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from ..core.numerics.degrees import metres_per_degree
+from ..core.numerics.geometry import metres_per_degree
 from .polynomials import evaluate
 
 

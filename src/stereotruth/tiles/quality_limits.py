@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ..core.config.labels import Limits
+from ..core.config.configuration import Limits
 
 FIGURES = {  # the figure that a limit is for; of signed figures, the size counts
     "max_gcp_rms_px": "gcp_rms_px",

@@ -38,7 +38,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.bilinear import bilinear
+from ..core.numerics.interpolation import bilinear
 from ..pages.pictures import stretch
 
 Floats = NDArray[np.float64]

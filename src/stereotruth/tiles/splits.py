@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from ..core.numerics.degrees import metres_per_degree
+from ..core.numerics.geometry import metres_per_degree
 from .manifest import Tile, manifest_rows
 from .split_names import NONE, SPLITS
 

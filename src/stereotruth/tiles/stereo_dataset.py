@@ -30,9 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.products.files import read_sealed
-from ..core.products.folders import files_below
-from ..core.products.names import plain_name
+from ..core.products.files import files_below, plain_name, read_sealed
 from ..core.products.provenance import file_sha256
 from ..core.products.rasters import read_disparity, read_labels
 from .layer_kinds import column as column_of

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.labels import Limits
-from ..core.numerics.error_sums import ErrorSum
+from ..core.config.configuration import Limits
+from ..core.numerics.statistics import ErrorSum
 from ..epipolar.warping import CorrelationSum
 from .label_doubts import SceneMatches, agreement
 from .label_surfaces import LabelSurface

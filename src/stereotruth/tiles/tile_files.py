@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.labels import Limits
+from ..core.config.configuration import Limits
 from ..core.errors import InputError
-from ..core.numerics.degrees import turn
+from ..core.numerics.geometry import turn
 from ..core.products.files import link
-from ..core.products.finished_pieces import Ledger
 from ..core.products.provenance import digest, file_sha256
 from ..core.products.rasters import write_tiff
+from ..core.products.resumable_grids import Ledger
 from ..epipolar.warping import agreement, warp_rows
 from .label_surfaces import label_surfaces
 from .layer_kinds import column

@@ -8,8 +8,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from ..core.errors import InputError
-from ..core.products.files import read_json
-from ..core.products.folders import is_foreign
+from ..core.products.files import is_foreign, read_json
 from ..core.products.provenance import file_sha256, own_digest
 from .footprints import FOOTPRINTS, STYLE
 from .manifest import read_manifest

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.job import progress
-from ..core.numerics.summed_area import window_sums
+from ..core.numerics.windows import window_sums
 from .scene_stores import SceneStores
 
 MAX_RIGHT_NODATA = 0.01  # share of a right crop; ten columns of a slanted image border

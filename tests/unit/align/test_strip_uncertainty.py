@@ -9,7 +9,7 @@ import pytest
 
 from stereotruth.align.label_uncertainty import STEP, LabelUncertainty
 from stereotruth.align.strip_uncertainty import SQUARE_DEG, with_strips
-from stereotruth.core.numerics.degrees import exact_metres_per_degree
+from stereotruth.core.numerics.geometry import exact_metres_per_degree
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.lidar.point_store import SQUARES
 from stereotruth.lidar.strip_offsets import SHARE, Strip, StripKey, StripOffsets

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from stereotruth.core import sheets
-from stereotruth.core.dates import acquisition_time
 from stereotruth.core.errors import InputError
-from stereotruth.core.tables import SheetError
+from stereotruth.core.tables import SheetError, acquisition_time
 
 ROOT = Path(__file__).parents[3]
 CITIES = "city\tprefix\ttraining\tvalidation\ttesting\nQichun\tQC\t600\t80\t200\n"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from stereotruth.core.config.labels import Rectify
+from stereotruth.core.config.configuration import Rectify
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import open_grid, require_complete
 from stereotruth.epipolar.fit import fit_epipolar

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.status import Status, is_labelled
 from stereotruth.labels.crowns import _clearance, _higher
 from stereotruth.labels.recipe import label_window

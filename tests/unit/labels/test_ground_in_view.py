@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.labels import recipe as module
 from stereotruth.labels import scene_inputs
 from stereotruth.labels.ground_in_view import ground_in_view

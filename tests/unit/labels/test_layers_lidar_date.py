@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.status import is_labelled
 from stereotruth.labels.scene_inputs import SceneInputs

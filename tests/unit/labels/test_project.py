@@ -13,7 +13,7 @@ import zarr
 
 import stereotruth.labels.recipe as module
 from stereotruth.align.label_uncertainty import label_covariance
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import open_grid
 from stereotruth.core.status import Reason, Status, is_labelled

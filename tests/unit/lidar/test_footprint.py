@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.numerics.degrees import metres_per_degree
+from stereotruth.core.numerics.geometry import metres_per_degree
 from stereotruth.lidar.density import points_per_m2
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.lidar.ingest import ingest

@@ -11,7 +11,7 @@ import pyproj
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.numerics.degrees import DEGREE_M
+from stereotruth.core.numerics.geometry import DEGREE_M
 from stereotruth.lidar import lattice, point_store
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import (

@@ -9,7 +9,7 @@ import pytest
 from stereotruth.core import sheets
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.frames import DEFAULT_EPOCH
-from stereotruth.project.epochs import epoch_of_city
+from stereotruth.project.project import epoch_of_city
 
 TOWN = sheets.City("Town", "TN", 6, 1, 3)
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 
 from stereotruth.core.errors import InputError
-from stereotruth.project.check_table import said_once
-from stereotruth.project.findings import Findings, Level
+from stereotruth.project.findings import Findings, Level, said_once
 
 
 def test_refusals_and_warnings_are_findings():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.project.profiles import SHIPPED, copy_profile, list_profiles
+from stereotruth.project.new_project import SHIPPED, copy_profile, list_profiles
 from stereotruth.project.project import FILES
 
 

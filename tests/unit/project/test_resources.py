@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 from stereotruth.core.config.configuration import Configuration
 from stereotruth.project.check_scene import SceneFacts
+from stereotruth.project.expected import check_resources
 from stereotruth.project.findings import Findings, Level
-from stereotruth.project.resources import check_resources
 
 # As it was measured: 34000 x 30000 px, 80 M points in 20 files, a twentieth with LiDAR
 LARGE = SceneFacts("Large-1", pixels=1_020_000_000, points=80_000_000, lidar_files=20, covered=0.05)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.project.profiles import copy_profile
+from stereotruth.project.new_project import copy_profile
 from stereotruth.project.project import FILES, configured
 from stereotruth.project.run_workflow import (
     TRUSTED,

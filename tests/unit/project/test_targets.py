@@ -11,9 +11,15 @@ from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.errors import InputError
 from stereotruth.project.check import check_project
 from stereotruth.project.project import FILES
-from stereotruth.project.run_workflow import run_workflow
+from stereotruth.project.run_workflow import (
+    TARGETS,
+    list_targets,
+    need_scenes,
+    refuse_unknown,
+    rules,
+    run_workflow,
+)
 from stereotruth.project.status import show_status
-from stereotruth.project.targets import TARGETS, list_targets, need_scenes, refuse_unknown, rules
 
 
 def test_targets_are_listed_with_the_names_of_the_project(folder):

@@ -11,7 +11,7 @@ from stereotruth.project.check import check_project
 from stereotruth.project.findings import Level
 from stereotruth.project.main import init
 from stereotruth.project.project import configured, is_synthetic, lidar_of, read_scenes
-from stereotruth.project.twin_project import Options, with_twin
+from stereotruth.project.simulated_project import Options, with_twin
 
 from ...synthetic import house_points as place
 

@@ -11,7 +11,7 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from stereotruth.core.config.labels import Rectify
+from stereotruth.core.config.configuration import Rectify
 from stereotruth.core.errors import InputError
 from stereotruth.sensor.image_reader import Source, band_weights, open_pair
 

@@ -12,7 +12,7 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-from stereotruth.core.products.ungeoreferenced import open_raster
+from stereotruth.core.products.rasters import open_raster
 from stereotruth.sensor.tiff_blocks import _batches, damaged_block
 
 GREY = np.random.default_rng(0).integers(0, 900, (200, 300)).astype(np.uint16)

@@ -16,7 +16,7 @@ from stereocities.rpcs import NAMES, RATIOS, read_rpc, rpc_camera
 from stereocities.truth import truth_at
 from stereocities.twin_world import twin_city
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.ungeoreferenced import open_raster
+from stereotruth.core.products.rasters import open_raster
 
 from ...synthetic import house_points as place
 from ...synthetic.small_cities import ONE_BOX

@@ -9,7 +9,7 @@ from stereocities.camera import project, rays
 from stereocities.layout import frame_of
 from stereocities.site_images import camera_of, image_truth, pair_truth, site_points
 from stereocities.sites import LOWEST_SUN_DEG, drawn_site, sun_at
-from stereotruth.project.example_city import SITE
+from stereotruth.project.simulated_project import SITE
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.degrees import DEGREE_M
+from stereotruth.core.numerics.geometry import DEGREE_M
 from stereotruth.tiles.ground_heights import GROUND_CLASS, ground_cells, heights_above_ground
 
 ROWS, COLS, PX = 160, 200, 0.6

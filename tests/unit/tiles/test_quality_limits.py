@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereotruth.core.config.labels import Limits
+from stereotruth.core.config.configuration import Limits
 from stereotruth.tiles.quality_limits import FIGURES, flag, missed
 
 GOOD = {

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stereotruth.core.config.labels import Limits
+from stereotruth.core.config.configuration import Limits
 from stereotruth.core.errors import InputError
 from stereotruth.evaluate import labels_against_images
 from stereotruth.tiles import label_doubts

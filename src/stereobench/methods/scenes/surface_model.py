@@ -36,7 +36,7 @@ from rasterio.transform import from_origin
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import block_progress
 from stereotruth.core.kernels import inner, kernel
-from stereotruth.core.numerics.triangles import Three, plane_slopes, row_span
+from stereotruth.core.numerics.geometry import Three, plane_slopes, row_span
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.grids import Layer, blocks, require_complete
 from stereotruth.core.products.provenance import digest

@@ -9,9 +9,11 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, TypeVar
 
+from ..config.section import LONGEST_NAME
 from ..errors import InputError
 from .provenance import own_digest
 
@@ -194,3 +196,87 @@ def read_record(
         raise InputError(
             f"no {what} ({error})", file=path, remedy=f"run the {stage} stage again"
         ) from error
+
+
+FOREIGN = (  # what other programs leave beside the files that they open; in lower case
+    "*.aux.xml",  # GDAL, QGIS: statistics
+    "*.ovr",  # GDAL, QGIS: pyramids
+    *("*.qgs", "*.qgz", "*.qgs~", "*.qgz~", "*.qml", "*.qmd", "*.points"),  # QGIS
+    *(".ds_store", "._*", "thumbs.db", "desktop.ini", ".directory"),  # file managers
+)
+
+
+def is_foreign(name: str) -> bool:
+    """Whether a file of this name is one that another program has left."""
+    return any(fnmatch(name.lower(), pattern) for pattern in FOREIGN)
+
+
+def files_below(
+    folder: str | Path, enter: Callable[[Path], bool] = lambda folder: True
+) -> Iterator[Path]:
+    """All files below a folder, by name, links followed, each folder once.
+
+    ``enter``: which of its folders are gone into.
+    """
+    seen = set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        state = Path(place).stat()
+        if (state.st_dev, state.st_ino) in seen:  # a link to a folder above, or a second one
+            folders.clear()
+            continue
+        seen.add((state.st_dev, state.st_ino))
+        folders[:] = sorted(name for name in folders if enter(Path(place, name)))
+        yield from (Path(place, name) for name in sorted(names))
+
+
+LONGEST_PATH = 1000  # bytes of a path below a folder
+
+
+def defect_of(name: object, longest: int = LONGEST_NAME) -> str:
+    """Why a text is no plain name; empty if it is one."""
+    if not isinstance(name, str) or not name:
+        return "is empty"
+    if len(name.encode("utf-8", "surrogateescape")) > longest:
+        return f"is longer than {longest} bytes"
+    if "/" in name or "\\" in name or name.startswith("."):
+        return "leads to another folder, or to a hidden file"
+    if not name.isprintable():
+        return "has characters that cannot be printed"
+    return ""
+
+
+def plain_name(name: object, what: str, file: str | Path) -> str:
+    """A name that ``file`` states. Raises InputError if it is no plain name.
+
+    Plain: at most LONGEST_NAME bytes, printable, no ``/`` and no ``\\``, no dot at its beginning.
+    """
+    if defect := defect_of(name):
+        raise InputError(
+            f"{what} {shown(name)} {defect}",
+            file=file,
+            remedy=f"names have at most {LONGEST_NAME} characters, no / and no \\, and do not "
+            "begin with a dot; who made the file may mean harm",
+        )
+    return str(name)
+
+
+def path_below(path: object, what: str, file: str | Path) -> str:
+    """A path that ``file`` states. Raises InputError if it leads out of the file's folder."""
+    text = path if isinstance(path, str) else ""
+    defects = [defect_of(part, longest=255) for part in text.split("/")]
+    if len(text) > LONGEST_PATH:
+        defects.append(f"is longer than {LONGEST_PATH} characters")
+    if defect := next(filter(None, defects), ""):
+        raise InputError(
+            f"{what} {shown(path)} is no path below its folder: a part of it {defect}",
+            file=file,
+            remedy="paths are relative and name files below the folder; who made the file may mean "
+            "harm",
+        )
+    return text
+
+
+def shown(name: object) -> str:
+    """A text in quotation marks, cut short, fit for one line of any terminal."""
+    text = ascii(name)
+    return text if len(text) <= 80 else f"{text[:70]}…{text[-1]}"

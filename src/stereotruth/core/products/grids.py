@@ -8,11 +8,13 @@ of store checks that attribute.
 from __future__ import annotations
 
 import json
+import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from traceback import format_exception
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +29,30 @@ from .provenance import digest
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+def damaged_store(error: BaseException, inputs: Iterable[str | Path]) -> InputError | None:
+    """The damaged Zarr store among a failed job's ``inputs``; None if it failed for another cause.
+
+    Reads all chunks, so it is for a job that has failed anyhow.
+    """
+    if f"{os.sep}zarr{os.sep}" not in "".join(format_exception(error)):
+        return None
+    for store in map(Path, inputs):
+        if not (store / "zarr.json").is_file():
+            continue
+        try:
+            for _, array in zarr.open_group(store, mode="r").arrays():
+                step = (array.shards or array.chunks)[0]
+                for first in range(0, array.shape[0], step):
+                    array[first : first + step]
+        except Exception as refusal:  # decoders fail as they like
+            return InputError(
+                f"damaged Zarr store ({refusal})",
+                file=store,
+                remedy="delete it and run the workflow again",
+            )
+    return None
 
 
 METADATA = "zarr.json"  # of a store: all of its arrays' with its own

@@ -5,7 +5,7 @@ any rule, so that it outlives jobs, killed or not:
 
 ===================  ==============================================================================
 ``store/``           the arrays, without attributes of the scene
-``done/``            record of each block, one shard of each array; see :mod:`.finished_pieces`
+``done/``            record of each block, one shard of each array; see :mod:`.resumable_grids`
 ``layout.json``      shape, arrays and chunks
 ``lock``             held by the job at work here, shared by the parts of one scene
 ===================  ==============================================================================
@@ -32,12 +32,9 @@ import zarr
 from numpy.typing import NDArray
 
 from .files import atomic_file, link
-from .finished_pieces import Ledger
 from .grids import Layer, atomic_store, create_grid
-from .inputs import Marks, refuse_replaced
-from .locks import FileLock
-from .making import marks_of_inputs
-from .provenance import digest
+from .making import FileLock, Marks, marks_of_inputs, refuse_replaced
+from .provenance import digest, file_sha256
 
 log = logging.getLogger("stereotruth")
 Block = tuple[slice, slice]
@@ -195,3 +192,55 @@ def _lay_out(
     create_grid(store.store, shape, layers, chunk=chunk, shard=store.shard, attrs={})
     with atomic_file(store.folder / "layout.json") as scratch:
         scratch.write_text(json.dumps(layout))
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A piece that is there: ``sha256`` of those of its files that exist, ``result`` as given."""
+
+    sha256: Mapping[str, str]
+    result: Any
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """The records in a folder, one file each. Names of pieces are file names."""
+
+    folder: Path
+
+    def _file(self, name: str) -> Path:
+        return self.folder / f"{name}.json"
+
+    def put(self, name: str, key: str, files: Mapping[str, Path], result: Any) -> Piece:
+        """Record that a piece is done; ``result`` is JSON-ready."""
+        sums = {label: file_sha256(path) for label, path in files.items() if path.exists()}
+        record = {"format": FORMAT, "key": key, "sha256": sums, "result": result}
+        with atomic_file(self._file(name)) as scratch:
+            scratch.write_text(json.dumps(record))
+        return Piece(sums, result)
+
+    def get(self, name: str) -> Piece:
+        """The record of a piece that is known to be there."""
+        record = json.loads(self._file(name).read_text())
+        return Piece(record["sha256"], record["result"])
+
+    def find(self, name: str, key: str, files: Mapping[str, Path]) -> Piece | None:
+        """The piece, if it is there as ``key`` wants it; else what is left of it is removed."""
+        try:
+            record = json.loads(self._file(name).read_text())
+        except (FileNotFoundError, json.JSONDecodeError):
+            record = {}
+        if record.get("key") == key and record["format"] == FORMAT:
+            sums = {label: file_sha256(path) for label, path in files.items() if path.exists()}
+            if sums == record["sha256"]:
+                return Piece(sums, record["result"])
+        self._file(name).unlink(missing_ok=True)
+        for path in files.values():
+            path.unlink(missing_ok=True)
+        return None
+
+    def keep_only(self, names: set[str]) -> None:
+        """Forget all other pieces."""
+        for file in self.folder.glob("*.json"):
+            if file.stem not in names:
+                file.unlink()

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...core.errors import InputError
-from ...core.products.locks import exclusive
+from ...core.products.making import exclusive
 from ...core.products.rasters import read_image, read_tile
 from ...core.status import carries_label
 from ...pages.page import INDEX, way, write_page

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.numerics.degrees import metres_per_degree
+from ...core.numerics.geometry import metres_per_degree
 from ...pages.figures import AXES, Chart, Plot, look, on_the_ground, styled
 from ...pages.page import way, write_page
 from ...pages.pictures import DISPARITIES, Scale

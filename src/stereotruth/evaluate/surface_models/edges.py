@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from ...core.numerics.error_sums import quantile_bin
+from ...core.numerics.statistics import quantile_bin
 from ...lidar.height_raster import Floats
 from .reference import BUILDING, NONE, OTHER, TREE, WATER, Lattice
 

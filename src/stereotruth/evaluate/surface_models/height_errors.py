@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from ...core.numerics.error_sums import ErrorSum, Scale
+from ...core.numerics.statistics import ErrorSum, Scale
 from ...lidar.height_raster import Floats
 from .edges import near_steps
 from .reference import BUILDING, GROUND, OTHER, TREE, WATER, Lattice

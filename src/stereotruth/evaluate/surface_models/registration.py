@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from ...core.kernels import kernel
-from ...core.numerics.robust import huber_weights, median_and_nmad, reweighted_fit
+from ...core.numerics.statistics import huber_weights, median_and_nmad, reweighted_fit
 from ...lidar.height_raster import Floats, Window
 from .edges import Edges, measure
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from stereotruth.core.numerics.b_spline import cubic_slopes, cubic_weights
+from stereotruth.core.numerics.interpolation import cubic_slopes, cubic_weights
 
 
 @pytest.mark.parametrize("f", [0.0, 0.125, 0.5, 0.9, 1.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.bilinear import bilinear
+from stereotruth.core.numerics.interpolation import bilinear
 
 
 def surface(col, row):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.box_max import box_max
+from stereotruth.core.numerics.windows import box_max
 
 
 @pytest.mark.parametrize("kind", [bool, np.int64, np.float64])

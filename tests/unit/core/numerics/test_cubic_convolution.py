@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.cubic_convolution import (
+from stereotruth.core.numerics.interpolation import (
     four_point_value,
     four_point_weights,
     six_point_kernel,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereotruth.core.numerics.decimal_numbers import decimal_number
+from stereotruth.core.tables import decimal_number
 
 
 @pytest.mark.parametrize("text", ["0", "-0.5", "+1.25E-03", "5.", ".5", "1e5", "007"])

@@ -6,7 +6,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.core.numerics.degrees import exact_metres_per_degree, metres_per_degree
+from stereotruth.core.numerics.geometry import exact_metres_per_degree, metres_per_degree
 
 WGS84 = pyproj.Geod(ellps="WGS84")
 

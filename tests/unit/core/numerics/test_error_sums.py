@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.error_sums import Calibration, ErrorSum
-from stereotruth.core.numerics.robust import median_and_nmad
+from stereotruth.core.numerics.statistics import Calibration, ErrorSum, median_and_nmad
 
 # --------------------------------------------------------------------------------- statistics
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from stereotruth.core.numerics.hull import corners_of_hull
+from stereotruth.core.numerics.geometry import corners_of_hull
 
 
 @pytest.mark.parametrize("n", [3, 4, 50, 400])

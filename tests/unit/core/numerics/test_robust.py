@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.robust import (
+from stereotruth.core.numerics.statistics import (
     biweight,
     huber_weights,
     median_and_nmad,

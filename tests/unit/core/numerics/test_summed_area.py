@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.summed_area import summed_area, window_sums
+from stereotruth.core.numerics.windows import summed_area, window_sums
 
 
 @pytest.mark.parametrize("size", [1, 3, 6])

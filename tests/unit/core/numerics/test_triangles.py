@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.triangles import edge_crossing, plane_slopes, row_span
+from stereotruth.core.numerics.geometry import edge_crossing, plane_slopes, row_span
 
 
 def covered(x, y, size: int) -> np.ndarray:

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.damaged_store import damaged_store
-from stereotruth.core.products.grids import Layer, atomic_store, create_grid, require_complete
+from stereotruth.core.products.grids import (
+    Layer,
+    atomic_store,
+    create_grid,
+    damaged_store,
+    require_complete,
+)
 from stereotruth.core.products.making import making
 
 LAYERS = {"image": Layer("uint16", 0, {"units": "DN", "long_name": "image"})}

@@ -9,7 +9,7 @@ import pytest
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.products import inputs
-from stereotruth.core.products.inputs import Checksums, checksum, marks, refuse_replaced, stamp
+from stereotruth.core.products.making import Checksums, checksum, marks, refuse_replaced, stamp
 
 
 @pytest.fixture

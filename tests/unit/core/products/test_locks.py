@@ -8,7 +8,7 @@ import signal
 import time
 from pathlib import Path
 
-from stereotruth.core.products.locks import FileLock, exclusive
+from stereotruth.core.products.making import FileLock, exclusive
 
 SPAWN = multiprocessing.get_context("spawn")
 

@@ -6,7 +6,7 @@ import pytest
 
 from stereotruth.core.config.section import LONGEST_NAME
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.names import path_below, plain_name
+from stereotruth.core.products.files import path_below, plain_name
 
 OUTSIDE = ("/etc/x", "../../../../x", "..", ".", ".x", "a\\b", "C:\\x", "a\0b", "a\nb")
 NO_NAMES = (*OUTSIDE, "a/b", "", "x" * (LONGEST_NAME + 1), "é" * 51, "a\udce9", 7)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stereocities.sites import drawn_site
-from stereotruth.core.numerics.degrees import metres_per_degree
+from stereotruth.core.numerics.geometry import metres_per_degree
 from stereotruth.evaluate.report.site_page import write_site_page
 from stereotruth.sensor.pair_quality import rate
 

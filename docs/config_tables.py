@@ -1,6 +1,6 @@
 """The files that follow from the sections: ``config/config.yaml`` and the tables of the guide.
 
-python -m stereotruth.project.config_tables
+python docs/config_tables.py
 """
 
 from __future__ import annotations
@@ -14,10 +14,17 @@ from typing import Any
 
 import yaml
 
-from ..core.config.configuration import Configuration
-from ..core.config.methods import DATASETS, METHODS, Training
-from ..core.config.section import Key, attributes_of, fields_of, meaning, nested, values_of
-from ..core.sheets import City, Image, Scene
+from stereotruth.core.config.configuration import Configuration
+from stereotruth.core.config.methods import DATASETS, METHODS, Training
+from stereotruth.core.config.section import (
+    Key,
+    attributes_of,
+    fields_of,
+    meaning,
+    nested,
+    values_of,
+)
+from stereotruth.core.sheets import City, Image, Scene
 
 BY_NAME = {"datasets": DATASETS, "methods": METHODS}
 BELOW = ("training", "benchmark.methods")  # have tables of their own
@@ -65,7 +72,7 @@ def with_tables(guide: str) -> str:
 
 HEAD = """\
 # Every key with its default; units and effects are in config/README.md. Written by
-# python -m stereotruth.project.config_tables. Your own scenes: write a file that overrides what
+# python docs/config_tables.py. Your own scenes: write a file that overrides what
 # differs, and pass it with --configfile.
 """
 LONGEST_LINE = 130  # characters
@@ -112,7 +119,7 @@ def _with_remark(line: str, key: Key) -> str:
 
 
 USAGE = """\
-Usage: python -m stereotruth.project.config_tables [FOLDER]
+Usage: python docs/config_tables.py [FOLDER]
 Writes config.yaml with all defaults, and the tables of keys in README.md, in FOLDER (config).
 For developers, in a checkout: the reference is made of the classes that check a configuration.
 """

@@ -1,20 +1,30 @@
-"""Small synthetic cities whose files look like a user's own: a pair, and a site of images."""
+"""Projects whose input is simulated: examples (a pair, a site), and twins of real places."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from stereocities.cities import Character, CitySpec, SceneSpec, lidar_files
+from stereocities.cities import (
+    LEFT_GSD_M,
+    Character,
+    CitySpec,
+    SceneSpec,
+    file_of,
+    lidar_files,
+    write_city,
+)
 from stereocities.control_points import simulate_points
 from stereocities.lidar import simulate_lidar_tile
 from stereocities.render import simulate_image
 from stereocities.site_images import simulate_site_image, simulate_site_points
 from stereocities.sites import SiteSpec, images_drawn
+from stereocities.twin_world import SUN_DEG, twin_city
 
+from ..core.errors import InputError
 from ..core.sheets import Image
+from .new_project import append_row, begin, city_row
 
 DEMO = CitySpec(
     name="Demo",
@@ -106,6 +116,19 @@ def make_site(folder: Path) -> str:
 EXAMPLES = {"demo": make_example, "site": make_site}
 
 
+def with_example(folder: str | Path, name: str) -> str:
+    """A new project with a small synthetic city, ``demo`` or ``site``; returns the next step.
+
+    Images, LiDAR and control points are made here. Raises InputError for another name.
+    """
+    if name not in EXAMPLES:
+        raise InputError(
+            f"no example {name!r}", remedy=f"take one of {', '.join(EXAMPLES)} after --example"
+        )
+    begin(folder)
+    return EXAMPLES[name](Path(folder))
+
+
 def _make_lidar(city: CitySpec, folder: Path) -> None:
     """The LiDAR of the city's one scene."""
     (scene,) = city.scenes
@@ -113,19 +136,78 @@ def _make_lidar(city: CitySpec, folder: Path) -> None:
         simulate_lidar_tile(city, scene, file, folder / file, spacing_m=SPACING_M, seed=SEED)
 
 
-def city_row(name: str, prefix: str) -> dict[str, object]:
-    """The row of the cities sheet for a small city."""
-    return {"city": name, "prefix": prefix, "training": 6, "validation": 1, "testing": 3}
-
-
-def append_row(sheet: Path, values: dict[str, object]) -> None:
-    """One more line of a sheet, in the order of its header."""
-    header = sheet.read_text(encoding="utf-8").splitlines()[0].split("\t")
-    with sheet.open("a", newline="", encoding="utf-8") as stream:
-        csv.DictWriter(stream, header, delimiter="\t", lineterminator="\n").writerow(values)
-
-
 def append_settings(folder: Path, lines: Sequence[str]) -> None:
     """More lines at the end of a new project's configuration."""
     with (folder / "config.yaml").open("a", encoding="utf-8") as stream:
         stream.write("\n" + "\n".join(lines) + "\n")
+
+
+NAME, PREFIX = "Twin", "TW"
+LEAST_PX = 256  # of the left image's shorter side: fewer have no tile
+DENSITY = 1 / 0.4**2  # points per m², that of the six cities
+DENSITIES = 0.04, 100.0  # points per m², what simulate.lidar_spacing_m can be
+
+
+@dataclass(frozen=True)
+class Options:
+    """What ``stereotruth init --twin`` is told besides the file; see its help."""
+
+    crs: str = ""
+    density: float = DENSITY
+    sun_deg: tuple[float, float] = SUN_DEG
+    size_px: tuple[int, int] | None = None
+    rpcs: tuple[Path, Path] | None = None
+
+
+def with_twin(folder: str | Path, file: Path, options: Options) -> str:
+    """A new project whose city is the twin of the place of a LAS or LAZ file; the next step.
+
+    Raises InputError: no such file, none of points, no coordinate system, options out of bounds.
+    """
+    low, high = DENSITIES
+    if not low <= options.density <= high:
+        raise InputError(
+            f"{options.density:g} points per m²", remedy=f"--density takes {low:g} to {high:g}"
+        )
+    if not 15 <= options.sun_deg[1] <= 90:
+        raise InputError(
+            f"a sun {options.sun_deg[1]:g} degrees high",
+            remedy="--sun takes azimuth and elevation, 15 to 90 degrees high",
+        )
+    city = twin_city(
+        NAME,
+        file.resolve(),
+        crs=options.crs,
+        size_px=options.size_px,
+        sun_deg=options.sun_deg,
+        rpcs=None if options.rpcs is None else tuple(rpc.resolve() for rpc in options.rpcs),
+    )
+    (scene,) = city.scenes
+    shorter = min(scene.cols, scene.rows)
+    if shorter < LEAST_PX:
+        raise InputError(
+            f"the left image would have {scene.cols} x {scene.rows} px of {LEFT_GSD_M} m",
+            file=file,
+            remedy=f"name a place of {LEAST_PX * LEFT_GSD_M:.0f} m or more, or a greater --size",
+        )
+    begin(folder)
+    folder = Path(folder)
+    write_city(city, folder / file_of(NAME))
+    data = file_of(NAME).parent / scene.name
+    row = {
+        "scene": scene.name,
+        "city": NAME,
+        "left_image": data / "left.tif",
+        "right_image": data / "right.tif",
+        "lidar": data / "lidar",
+        "gcps": data / "gcps.csv",
+    }
+    append_row(folder / "scenes.tsv", row)
+    append_row(folder / "cities.tsv", city_row(NAME, PREFIX))
+    side = next(n for n in (1024, 512, 256, 128) if n <= shorter * 0.6 or n == 128)
+    append_settings(
+        folder,
+        ["simulate:", f"  lidar_spacing_m: {options.density**-0.5:.3g} # {options.density:g} points"
+         " per m²", "tiles:", f"  size: {side}"],
+    )  # fmt: skip
+    return f"stereotruth run tiles/{NAME} evaluate report"

@@ -1,9 +1,12 @@
-"""Which tiles go into what both images show, and what share of their pixels will have a label."""
+"""What a run gives and takes: tiles and labels by the headers of its files; time, disk, memory."""
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,14 +14,28 @@ from numpy.typing import NDArray
 
 from ..core.config.configuration import Configuration
 from ..core.errors import in_number
-from ..core.numerics.degrees import DEGREE_M
-from ..core.numerics.summed_area import summed_area, window_sums
+from ..core.numerics.geometry import DEGREE_M
+from ..core.numerics.windows import summed_area, window_sums
 from ..epipolar.model import EpipolarModel
 from ..lidar.survey import SurveyedFile
 from ..tiles.windows import cell_step
-from .estimates import estimates
 from .findings import Findings, Level
 
+# Shares of the pixels that both views see which get a label, by recipe, at so many points a pixel:
+# means of three fresh cities by bench/density.py.
+POINTS_PER_PX = (0.042, 0.106, 0.212, 0.424, 0.847, 1.7, 2.54)
+LABELLED = {
+    "paper": (0.0363, 0.0887, 0.17, 0.315, 0.541, 0.794, 0.878),
+    "surface": (0.52, 0.63, 0.711, 0.776, 0.828, 0.881, 0.9),
+}
+# Seconds of one core, by bench/throughput.py and a run of 34000 x 30000 px with three scenes: for
+# each point (ingest, project), pixel (rectify and the scan for points), pixel with LiDAR (project
+# and export), scene, and start of a job.
+POINT_S, PX_S, COVERED_PX_S, SCENE_S, JOB_S = 9.6e-7, 1.2e-6, 9.8e-6, 60.0, 8.0
+JOBS = 5  # of a scene, beside one for each LiDAR file
+POINT_BYTES, PX_BYTES = 12.0, 24.0  # on the disk
+SPARE = 1.2  # of the disk: logs, records, blocks in the making
+MEMORY = 4.0e9  # that rules of the way to tiles ask for
 SUPPORT_PX = 2.0  # around a place, of an image that is resampled by cubic convolution
 NODES = 128  # along the longer side of the grid
 SMALL_HOLE_M2, SMALL_HOLE = 10_000, 0.001  # rims that are not worth a line: area, and share
@@ -113,8 +130,7 @@ def check_frame(nodes: Nodes, settings: Configuration, found: Findings) -> None:
 
 def expected_share(points_per_px: float, recipe: str) -> float:
     """Share of the pixels which both views see that will have a label."""
-    of = estimates()["labelled"]
-    return float(np.interp(points_per_px, [0.0, *of["points_per_px"]], [0.0, *of[recipe]]))
+    return float(np.interp(points_per_px, [0.0, *POINTS_PER_PX], [0.0, *LABELLED[recipe]]))
 
 
 def pixel_m2(model: EpipolarModel) -> float:
@@ -222,3 +238,65 @@ def _hold_against_tiles(
         f"it), tiles.min_labelled asks for {needed:.0%}",
         remedy,
     )
+
+
+@dataclass
+class SceneFacts:
+    """What the run's time and disk follow from."""
+
+    scene: str
+    pixels: int = 0  # of the epipolar grid
+    points: int = 0  # of the LiDAR
+    lidar_files: int = 0
+    covered: float = 1.0  # share of the grid
+
+
+def duration(seconds: float) -> str:
+    """A time span in the words of a person."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
+
+def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
+    """Say what a run from nothing takes, and refuse a disk that is too small for it."""
+    if not facts:
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    points, pixels = (sum(getattr(f, name) for f in facts) for name in ("points", "pixels"))
+    covered = sum(fact.pixels * fact.covered for fact in facts)
+    seconds = POINT_S * points + PX_S * pixels + COVERED_PX_S * covered + SCENE_S * len(facts)
+    seconds += JOB_S * sum(JOBS + fact.lidar_files for fact in facts)
+    needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels)
+    free = shutil.disk_usage(Path.cwd()).free
+    found.say(
+        "time",
+        Level.FACT,
+        f"about {duration(seconds / max(cores or 1, 1))} on the {cores} cores of this machine, "
+        "from nothing to tiles",
+    )
+    if needed > free:
+        found.say(
+            "disk",
+            Level.ERROR,
+            f"{_gb(needed)} are needed in {Path.cwd()}, {_gb(free)} are free",
+            "make space, or work in a folder on a larger disk",
+        )
+    else:
+        found.say("disk", Level.FACT, f"{_gb(needed)} of the {_gb(free)} that are free")
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if memory < MEMORY:
+        found.say(
+            "memory",
+            Level.DOUBT,
+            f"{_gb(memory)} in all, jobs ask for up to {_gb(MEMORY)}",
+            "run with --cores 1",
+        )
+    else:
+        found.say("memory", Level.FACT, f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
+
+
+def _gb(count: float) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 5e7 else "less than 0.1 GB"

@@ -1,4 +1,4 @@
-"""Sums over rectangles of a grid: of any size by one table, of one size by running sums."""
+"""."""
 
 from __future__ import annotations
 
@@ -63,3 +63,22 @@ def window_sums(values: NDArray[Any], size: int) -> NDArray[Any]:
     upper, lower = table[:rows], table[size : size + rows]
     left, right = np.s_[:, :cols], np.s_[:, size : size + cols]
     return lower[right] - upper[right] - lower[left] + upper[left]
+
+
+def box_max(values: NDArray[Any], reach: int) -> NDArray[Any]:
+    """Maximum [h, w] over squares of 2 * reach + 1 of ``values`` [h, w], cut off at the edges.
+
+    By doubling: each step takes the maximum of two runs of rows.
+    """
+    size = 2 * reach + 1
+    for axis in (0, 1):
+        # what is repeated beyond an edge lies in the same squares as the edge
+        pad = [(reach, reach) if a == axis else (0, 0) for a in (0, 1)]
+        out = np.moveaxis(np.pad(values, pad, mode="edge"), axis, 0)
+        width = 1
+        while width < size:
+            step = min(width, size - width)
+            out = np.maximum(out[:-step], out[step:])
+            width += step
+        values = np.moveaxis(out, 0, axis)
+    return np.ascontiguousarray(values)

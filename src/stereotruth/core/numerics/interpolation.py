@@ -1,17 +1,44 @@
-"""Cubic convolution (Keys 1981, IEEE TASSP 29): interpolation between samples a pixel apart.
-
-With four samples (section IV, a = -1/2) quadratic polynomials come out exactly, with six (section
-VI) cubic ones.
-"""
+"""."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..kernels import inlined, inner
 
 Floats = NDArray[np.float64]
+
+
+@inlined
+def between_four(
+    upper_left: float,
+    upper_right: float,
+    lower_left: float,
+    lower_right: float,
+    right: float,
+    down: float,
+) -> float:
+    """Value ``right`` and ``down`` in [0, 1] of a cell from its upper left corner; or arrays."""
+    upper = (1.0 - right) * upper_left + right * upper_right
+    return (1.0 - down) * upper + down * ((1.0 - right) * lower_left + right * lower_right)
+
+
+def bilinear(grid: NDArray[np.floating], col: ArrayLike, row: ArrayLike) -> Floats:
+    """Values of a ``grid`` [h, w] at places (col, row) of any shape, whole numbers at its samples.
+
+    NaN outside of the grid, and where one of the four samples around is NaN.
+    """
+    col, row = np.asarray(col, np.float64), np.asarray(row, np.float64)
+    height, width = grid.shape
+    inside = (row >= 0) & (col >= 0) & (row <= height - 1) & (col <= width - 1)  # not NaN
+    col, row = np.where(inside, col, 0.0), np.where(inside, row, 0.0)
+    i, j = col.astype(np.intp), row.astype(np.intp)
+    below, beside = np.minimum(j + 1, height - 1), np.minimum(i + 1, width - 1)
+    corners = grid[j, i], grid[j, beside], grid[below, i], grid[below, beside]
+    return np.where(inside, between_four(*corners, col - i, row - j), np.nan)
+
+
 Singles = NDArray[np.float32]
 
 
@@ -99,3 +126,25 @@ def six_point_weights_of_row(f: Singles, weights: Singles) -> None:
         a, b, c, d = TAP_POLYNOMIALS[tap]
         for k in range(f.size):
             weights[tap, k] = ((a * f[k] + b) * f[k] + c) * f[k] + d
+
+
+Four = tuple[float, float, float, float]
+
+
+@inlined
+def cubic_weights(f: float) -> Four:
+    """Weights of the four coefficients around a place ``f`` in [0, 1] of a cell; their sum is 1."""
+    e = 1.0 - f
+    return (
+        e * e * e / 6.0,
+        ((3.0 * f - 6.0) * f * f + 4.0) / 6.0,
+        ((3.0 * e - 6.0) * e * e + 4.0) / 6.0,
+        f * f * f / 6.0,
+    )
+
+
+@inlined
+def cubic_slopes(f: float) -> Four:
+    """Derivatives of :func:`cubic_weights` by ``f``; their sum is 0."""
+    e = 1.0 - f
+    return -0.5 * e * e, (1.5 * f - 2.0) * f, (2.0 - 1.5 * e) * e, 0.5 * f * f
