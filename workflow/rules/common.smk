@@ -40,7 +40,7 @@ try:
     CITIES, SCENES = read_scenes(SETTINGS, ask=workflow.is_main_process)
     IMAGES = read_images(SETTINGS, CITIES)
     IMAGE_NAMES = {name: names_in_pair(scene, IMAGES) for name, scene in SCENES.items()}
-    ACQUIRED = lidar_days(SETTINGS, CITIES)
+    ACQUIRED = lidar_days(SETTINGS)
     LIDAR = {name: lidar_of(scene, SETTINGS) for name, scene in SCENES.items()}
     STORES = stores_of(SCENES, LIDAR)
     SURFACES = surfaces_of(STORES)

@@ -28,7 +28,7 @@ from .expected import Nodes, check_frame
 from .findings import Findings, Level
 from .list_tiles import list_tiles, margin_of
 from .new_project import append_row, city_row
-from .project import configured, sheet, with_stand_ins
+from .project import configured, read_rows, sheet, with_stand_ins
 
 SUFFIXES = {".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img"}
 # Names of suppliers (GaoFen-7, ZY-3, Cartosat, ALOS PRISM) for the views along the track, and the
@@ -172,8 +172,7 @@ def add_scene(
     """
     settings, _ = configured(configfiles)
     rows, towns = (Path(sheet(settings, kind)) for kind in ("scenes", "cities"))
-    cities = sheets.read_cities(towns)
-    scenes = sheets.read_scenes(rows, cities)
+    cities, scenes, _ = read_rows(settings)
     pair, lines = find_pair(delivery)
     _refuse_repeated(pair, scenes, rows)
     city = city or _word(_folder_name(delivery))
@@ -328,9 +327,9 @@ def _as_options(remedy: str) -> str:
 def list_scenes(configfiles: Sequence[Path] | None = None) -> list[str]:
     """A line for each scene of the sheet: name, city, images."""
     settings, _ = configured(configfiles)
-    rows = Path(sheet(settings, "scenes"))
-    scenes = sheets.read_scenes(rows, sheets.read_cities(sheet(settings, "cities")))
+    _, scenes, _ = read_rows(settings)
     if not scenes:
+        rows = sheet(settings, "scenes")
         return [f"{rows}: no scene. Next: stereotruth scene add DELIVERY --lidar FOLDER"]
     width = max(map(len, scenes))
     return [

@@ -1,9 +1,9 @@
-"""What a check has to say."""
+"""What a check has to say, and tables of that on a terminal."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -122,14 +122,26 @@ def said_once(every: Sequence[Findings]) -> list[tuple[str, list[Finding]]]:
     return parts
 
 
+def wide(console: Console | None = None) -> Console:
+    """A console of WIDTH characters, where it is no terminal, which has a width of its own."""
+    console = console or Console(highlight=False)
+    if console.is_terminal:
+        return console
+    return Console(width=WIDTH, highlight=False, file=console.file)
+
+
+def plain_table(headings: Sequence[str], whole: Collection[str] = ()) -> Table:
+    """A table without lines; the columns ``whole`` are not broken."""
+    table = Table(box=None, pad_edge=False, show_edge=False, header_style="bold")
+    for heading in headings:
+        table.add_column(heading, overflow="fold", no_wrap=heading in whole)
+    return table
+
+
 def show(every: Sequence[Findings], console: Console | None = None) -> bool:
     """Print one table, problems with their remedies below them; whether a run would fail."""
-    console = console or Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(width=WIDTH, highlight=False, file=console.file)
-    table = Table(box=None, pad_edge=False, show_edge=False, header_style="bold")
-    for heading in ("scene", "about", "", "finding"):
-        table.add_column(heading, overflow="fold", no_wrap=heading in ("scene", ""))
+    console = wide(console)
+    table = plain_table(("scene", "about", "", "finding"), whole=("scene", ""))
     counts = dict.fromkeys((Level.ERROR, Level.DOUBT, Level.FACT), 0)
     for scene, findings in said_once(every):
         for k, found in enumerate(findings):

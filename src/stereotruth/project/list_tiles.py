@@ -12,7 +12,6 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..align.pair_ground import footprint_of
-from ..core import sheets
 from ..core.config.configuration import Configuration, Ingest
 from ..core.errors import InputError, in_number, without_secrets
 from ..core.products.remote_files import bring_image, is_remote, state_of
@@ -21,7 +20,7 @@ from ..lidar.catalogue_list import SUFFIX, ListedTile, TileList, write_list
 from ..lidar.declared_crs import LidarCRS, interpret
 from ..lidar.footprint import CELL_DEG, Footprint
 from .check import chosen
-from .project import configured, read_images, sheet
+from .project import configured, read_rows, sheet
 
 ASKED_AT_ONCE = 8
 NAMED = 5  # of many tiles
@@ -43,9 +42,8 @@ def list_of_scenes(
     :func:`..lidar.catalogue.read_catalogue`. Raises InputError; then nothing is written.
     """
     settings, _ = configured(configfiles)
-    cities = sheets.read_cities(sheet(settings, "cities"))
+    cities, scenes, _ = read_rows(settings)
     rows = sheet(settings, "scenes")
-    scenes = sheets.read_scenes(rows, cities, read_images(settings, cities))
     found = chosen(names, scenes, cities, rows)
     if not found:
         raise InputError("no scene in it", file=rows, remedy="add one, whose ground is then known")
@@ -146,7 +144,8 @@ def _asked(
 def _state(file: str, hosts: frozenset[str]) -> tuple[int, str] | None:
     """Bytes and content (of a server) of a tile; None if it is not there."""
     if is_remote(file):
-        return state_of(file, hosts)
+        state = state_of(file, hosts)
+        return None if state is None else (state.size, state.content)
     return (Path(file).stat().st_size, "") if Path(file).is_file() else None
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from ..core import sheets
 from ..core.config.configuration import Configuration
@@ -22,9 +21,9 @@ from ..sensor.linked_images import Links, Names, new_links
 from ..sensor.pair_light import DIACHRONIC_DAYS
 from ..sensor.pair_quality import USUAL_ROUGHNESS_M, RatedPair, rate
 from ..sensor.site_pairs import SitePair
-from .findings import WIDTH
+from .findings import plain_table, wide
 from .new_project import append_row
-from .project import configured, names_in_pair, read_images, sheet
+from .project import configured, names_in_pair, read_rows, sheet
 from .site import images_of, scene_pairs
 
 CONVERGENCE_DEG = (5.0, 45.0)  # of chosen pairs, where nothing else is said
@@ -142,9 +141,7 @@ def _alike(one: SitePair, other: SitePair) -> bool:
 
 def roughness_of(city: str, settings: Configuration) -> float | None:
     """Roughness of a city by the points that its scenes have ingested, m; None without any."""
-    cities = sheets.read_cities(sheet(settings, "cities"))
-    images = read_images(settings, cities)
-    scenes = sheets.read_scenes(sheet(settings, "scenes"), cities, images)
+    _, scenes, _ = read_rows(settings)
     folders = [INGESTED / city / name for name, scene in scenes.items() if scene.city == city]
     stores = [PointStore(path) for folder in folders for path in sorted(folder.glob("*.points"))]
     return roughness_m(stores) if stores else None
@@ -157,8 +154,7 @@ def rated_pairs(
 
     ``roughness`` of the site, m; None: not known.
     """
-    cities = sheets.read_cities(sheet(settings, "cities"))
-    opened = images_of(city, read_images(settings, cities), settings)
+    opened = images_of(city, read_rows(settings)[2], settings)
     rated = rate([one.image for one in opened], roughness)
     if not rated:
         raise InputError(
@@ -182,9 +178,7 @@ def write_pairs(
     InputError if there is no LiDAR to be named.
     """
     rows = Path(sheet(settings, "scenes"))
-    cities = sheets.read_cities(sheet(settings, "cities"))
-    images = read_images(settings, cities)
-    scenes = sheets.read_scenes(rows, cities, images)  # cells as they stand there
+    _, scenes, images = read_rows(settings)
     of_city = [scene for scene in scenes.values() if scene.city == city]
     here = {
         column: given.get(column) or (getattr(of_city[0], column) if of_city else "")
@@ -277,9 +271,7 @@ def list_pairs(
     lines = [_in_words(city, roughness)]
     if choice is not None:
         lines.append(write_pairs(city, choice, rated, settings, given))
-    cities = sheets.read_cities(sheet(settings, "cities"))
-    images = read_images(settings, cities)
-    scenes = sheets.read_scenes(sheet(settings, "scenes"), cities, images)
+    _, scenes, images = read_rows(settings)
     chosen = scene_pairs(city, scenes, images)
     if chosen:
         lines.append(f"* {len(chosen)} of them are scenes of {sheet(settings, 'scenes')}")
@@ -326,12 +318,7 @@ def show_pairs(
 
     ``chosen``: names of the images of pairs that are scenes.
     """
-    console = console or Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(width=WIDTH, highlight=False, file=console.file)
-    shown = Table(box=None, pad_edge=False, show_edge=False, header_style="bold")
-    for heading in COLUMNS:
-        shown.add_column(heading, overflow="fold", no_wrap=heading != "reason")
+    console, shown = wide(console), plain_table(COLUMNS, whole=COLUMNS[:-1])
     for cells in table(rated, chosen):
         shown.add_row(*map(escape, cells))
     console.print(shown)

@@ -1,4 +1,4 @@
-"""What a folder is worked with: configuration, its sheets and LiDAR."""
+"""What a folder is worked with: configuration, sheets, LiDAR, and the epoch of each city."""
 
 from __future__ import annotations
 
@@ -58,8 +58,7 @@ MOST_VALUES = 200_000
 def configured(files: Sequence[str | Path] | None = None) -> tuple[Configuration, str]:
     """The configuration of this folder as a run reads it, and the names of the files it is from.
 
-    ``files`` stand in the place of the folder's ``config.yaml``. Raises InputError that names file
-    and key, and where there is no configuration.
+    ``files`` stand in the place of the folder's ``config.yaml``. Raises InputError.
     """
     require_project(files)
     own = [Path(CONFIG)] if Path(CONFIG).is_file() else []
@@ -109,7 +108,8 @@ def require_scenes(files: Sequence[str | Path] | None = None) -> None:
 def read_mapping(file: Path) -> dict[str, Any]:
     """The keys and values of a YAML file. Raises InputError, naming it, if it has none.
 
-    Refused is also what grows beyond all measure when its aliases are put in.
+    Refused are also keys that stand twice, and what grows beyond all measure when its aliases are
+    put in.
     """
     try:
         if file.stat().st_size > MOST_BYTES:
@@ -120,23 +120,20 @@ def read_mapping(file: Path) -> dict[str, Any]:
             )
         loader = yaml.SafeLoader(file.read_text(encoding="utf-8-sig"))
         node = loader.get_single_node()
-        _refuse_repeated(node, file)
-        _refuse_multiplied(node, file)
+        _refuse_repeated_and_multiplied(node, file)
         found = None if node is None else loader.construct_document(node)
     except FileNotFoundError:
         raise InputError("no such file", file=file, remedy="correct its path") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"is no UTF-8 ({error})", file=file, remedy="save it as UTF-8") from None
-    except RecursionError:
-        raise InputError("is nested too deeply", file=file, remedy="write it flat") from None
+    except (UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
+        kinds = {UnicodeDecodeError: "is no UTF-8", RecursionError: "is nested too deeply"}
+        raise InputError(
+            f"{kinds.get(type(error), 'cannot be read as YAML')} ({' '.join(str(error).split())})",
+            file=file,
+            remedy="correct what it names, and save it as UTF-8",
+        ) from None
     except OSError as error:
         raise told_by_system(error) or InputError(
             f"cannot be read: {error.strerror}", file=file, remedy="see what lies there"
-        ) from None
-    except yaml.YAMLError as error:
-        problem = " ".join(str(error).split())
-        raise InputError(
-            f"cannot be read as YAML ({problem})", file=file, remedy="correct what it names"
         ) from None
     if found is not None and not isinstance(found, dict):
         raise InputError(
@@ -145,43 +142,30 @@ def read_mapping(file: Path) -> dict[str, Any]:
     return found or {}
 
 
-def _refuse_repeated(top: yaml.Node | None, file: Path) -> None:
-    """Raise InputError if a key stands twice in one mapping: YAML itself takes the last."""
-    waiting, seen = [top], set()
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen or not isinstance(node, yaml.CollectionNode):
-            continue
-        seen.add(id(node))
+def _refuse_repeated_and_multiplied(top: yaml.Node | None, file: Path) -> None:
+    """Raise InputError if a key stands twice in one mapping, of which YAML would take the last, or
+    if a document has more than MOST_VALUES with all aliases put in."""
+    counts: dict[int, float] = {}
+
+    def count(node: yaml.Node) -> float:
+        if id(node) in counts:
+            return counts[id(node)]
+        counts[id(node)] = math.inf  # of an alias to what it stands in
+        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
         if isinstance(node, yaml.MappingNode):
             lines: dict[str, int] = {}
-            for key, _ in node.value:
+            for key, _ in parts:
+                name = key.value if isinstance(key, yaml.ScalarNode) else "<<"
                 line = key.start_mark.line + 1
-                name = key.value if isinstance(key, yaml.ScalarNode) else ""
                 if name in lines and name != "<<":
                     raise InputError(
                         f"{name!r} stands twice, in lines {lines[name]} and {line}",
                         file=file,
                         remedy="put what both have under one of them",
                     )
-                if name:
-                    lines[name] = line
-            waiting += [value for _, value in node.value]
-        else:
-            waiting += node.value
-
-
-def _refuse_multiplied(top: yaml.Node | None, file: Path) -> None:
-    """Raise InputError if a document has more than MOST_VALUES with all aliases put in."""
-    counts: dict[int, float] = {}
-
-    def count(node: yaml.Node) -> float:
-        if id(node) not in counts:
-            counts[id(node)] = math.inf  # of an alias to what it stands in
-            inside = node.value if isinstance(node, yaml.CollectionNode) else ()
-            pairs = isinstance(node, yaml.MappingNode)
-            parts = [part for pair in inside for part in pair] if pairs else inside
-            counts[id(node)] = 1 + sum(map(count, parts))
+                lines[name] = line
+            parts = [part for pair in parts for part in pair]
+        counts[id(node)] = 1 + sum(map(count, parts))
         return counts[id(node)]
 
     if top is not None and count(top) > MOST_VALUES:
@@ -196,11 +180,6 @@ def is_synthetic(scene: sheets.Scene) -> bool:
     """Whether the scene's input is made by the rules of simulate.smk."""
     made_here = SYNTHETIC_FOLDER / scene.city / scene.scene / "left.tif"
     return scene.left_image == str(made_here) and synthetic_city(scene.city) is not None
-
-
-def is_made(path: str) -> bool:
-    """Whether a file is made by the rules of simulate.smk."""
-    return Path(path).is_relative_to(SYNTHETIC_FOLDER)
 
 
 def here_or_shipped(path: str) -> str:
@@ -223,11 +202,7 @@ def read_scenes(
     Where a scene names files by URLs it gets their stand-ins (:mod:`.products.remote_files`).
     ``ask``: ask their servers what they are now; else take what a call before has found.
     """
-    cities = sheets.read_cities(sheet(settings, "cities"))
-    images = read_images(settings, cities)
-    rows = sheets.read_scenes(
-        sheet(settings, "scenes"), cities, images, cities_sheet=sheet(settings, "cities")
-    )
+    cities, rows, _ = read_rows(settings)
     scenes = dict(rows)
     for name, scene in rows.items():
         if is_synthetic(scene):
@@ -238,6 +213,17 @@ def read_scenes(
         for remark in dict.fromkeys(_remarks_on_lists(rows, scenes, settings)):
             log.warning("%s", remark)
     return cities, scenes
+
+
+def read_rows(
+    settings: Configuration,
+) -> tuple[dict[str, sheets.City], dict[str, sheets.Scene], dict[str, sheets.Image]]:
+    """Cities, scenes and images by name, as the sheets have them. Raises InputError."""
+    towns = sheet(settings, "cities")
+    cities = sheets.read_cities(towns)
+    images = read_images(settings, cities)
+    scenes = sheets.read_scenes(sheet(settings, "scenes"), cities, images, cities_sheet=towns)
+    return cities, scenes, images
 
 
 def read_images(
@@ -356,9 +342,9 @@ def _place(url: str, column: str, *, ask: bool) -> Path:
     return bring_image(url) if column.endswith("image") else stand_in(url)
 
 
-def lidar_days(settings: Configuration, cities: Mapping[str, sheets.City]) -> dict[str, list[str]]:
+def lidar_days(settings: Configuration) -> dict[str, list[str]]:
     """First and last day (ISO) of LiDAR files by path, of those whose lists of tiles say them."""
-    rows = sheets.read_scenes(sheet(settings, "scenes"), cities, read_images(settings, cities))
+    _, rows, _ = read_rows(settings)
     lists = {part for row in rows.values() for part in _lidar_parts(row) if is_list(part)}
     return {file: days for part in sorted(lists) for file, days in days_of_list(part).items()}
 
@@ -378,7 +364,7 @@ def lidar_of(scene: sheets.Scene, settings: Configuration) -> dict[str, Path]:
             remedy="name its file of ground control points, or set alignment.refine to true",
         )
     if is_synthetic(scene):
-        if not is_made(scene.gcps):
+        if not Path(scene.gcps).is_relative_to(SYNTHETIC_FOLDER):
             sheets.require_files(scene, rows, ["gcps"])
         made = lidar_files(city_of(scene.city), scene.scene)
         return sheets.store_names([Path(scene.lidar) / file for file in made])
@@ -478,9 +464,11 @@ ANYWHERE = (0.0, 0.0)  # degrees: a day does not depend on the place
 def epoch_of_city(
     city: sheets.City, scenes: Mapping[str, sheets.Scene], images: Mapping[str, sheets.Image]
 ) -> Epoch:
-    """The epoch of a city; the default where neither sheet nor image tells one.
+    """The epoch of all places of a city, in ITRF2020: plates move by 1 to 8 cm a year.
 
-    ``scenes``, ``images``: rows of the sheets, of this and of other cities.
+    That of the cities sheet, or else the mean day of the first scene whose images tell theirs, so
+    that scenes which are appended change nothing; the default where none does. ``scenes``,
+    ``images``: rows of the sheets, of this and of other cities.
     """
     if (year := epoch_year(city.epoch)) is not None:
         return Epoch(year, "the cities sheet")

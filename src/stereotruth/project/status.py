@@ -12,13 +12,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from ..core.errors import InputError
 from ..evaluate.report.index_page import PAGES
 from ..tiles.manifest import read_manifest
+from .findings import plain_table, wide
 from .project import configured, read_scenes, require_scenes, sheet
 from .run_workflow import arguments_for
 
@@ -207,15 +206,10 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
 def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> None:
     """Print a table of the cities."""
     every = status_of(cities, configfiles)
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(width=160, highlight=False)
-    table = Table(box=None, pad_edge=False, show_edge=False, header_style="bold")
-    for heading in ("city", "tiles", "made", "page", "a run would do, and why"):
-        table.add_column(heading, overflow="fold")
+    table = plain_table(("city", "tiles", "made", "page", "a run would do, and why"))
     for city in every:
         style = "green" if city.state == "up to date" else "yellow"
         page = ", ".join(city.pages) or "none"
         row = (city.city, f"[{style}]{city.state}[/{style}]", city.made or "none", page)
         table.add_row(*row, "\n".join(map(escape, city.why())))
-    console.print(table)
+    wide().print(table)

@@ -28,9 +28,9 @@ from pydantic import (
 )
 
 from ..errors import InputError
+from ..products.files import LONGEST_NAME
 
 Values = TypeVar("Values", bound=tuple)
-LONGEST_NAME = 100  # characters; a file's name has 255 bytes, with what is added to it
 LONGEST_VALUE = 300  # characters of a value in messages
 PATTERN = re.compile(r"\{[^{}]*\w[^{}]*\}")
 REPEATED = re.compile(r"(.+)\1{18}$")  # once more, and Snakemake takes it for an endless recursion

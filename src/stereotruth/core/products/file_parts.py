@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from ..errors import InputError, without_secrets
-from .remote_files import Ranges, ranges_reader, state_held, url_of
+from .remote_files import Ranges, State, ranges_reader, url_of
 
 FOLDER = Path("results", "copies")
 STREAM_BYTES = 4 << 20  # of a file that is read as a whole, at once
@@ -93,7 +93,7 @@ class RemoteParts(FileParts):
 
     def __init__(self, place: Path, url: str, keep: bool) -> None:
         self.name, self._place = without_secrets(url), place
-        self.size, _ = state_held(place)
+        self.size = State.held(place).size
         self._copies = copies_of(place, url) if keep else None
         self._read: Callable[[Ranges], list[bytes]] | None = None  # for what is not held
 
@@ -153,7 +153,7 @@ def open_stream(
 
 def copies_of(place: Path, url: str) -> Path | None:
     """Where copies of what a stand-in stands for are kept; None if its server names no content."""
-    size, content = state_held(place)
+    size, content, _ = State.held(place)
     if not content:
         return None
     key = json.dumps([without_secrets(url), size, content])

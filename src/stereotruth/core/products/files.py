@@ -13,11 +13,11 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ..config.section import LONGEST_NAME
 from ..errors import InputError
 from .provenance import own_digest
 
 Made = TypeVar("Made")
+LONGEST_NAME = 100  # bytes; a file's name has 255, with what is added to it
 
 
 @contextmanager

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import urlsplit
 
 from ..errors import InputError, install_extra
@@ -118,73 +118,80 @@ def bucket(url: str) -> tuple[Any, str]:
     return storage, name.rstrip("/")
 
 
-def _state(info: dict[str, Any], url: str, hosts: frozenset[str] = frozenset()) -> str:
-    """What a stand-in holds. Raises InputError where a server gives no parts of files."""
-    if info.get("size") is None or info.get("partial") is False:
-        raise InputError(
-            "its server tells no size, or gives files as a whole only",
-            file=url,
-            remedy="download it, and name the local file",
-        )
-    known = info.get("ETag") or info.get("Last-Modified") or info.get("LastModified") or ""
-    state = {"size": int(info["size"]), "content": str(known)}
-    return json.dumps(state | ({"hosts": sorted(hosts)} if hosts else {})) + "\n"
+class State(NamedTuple):
+    """What a stand-in holds: bytes of its file, what the server calls its content (ETag, or else a
+    time), and the hosts beside its own that it may redirect to."""
+
+    size: int
+    content: str
+    hosts: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, info: dict[str, Any], url: str, hosts: frozenset[str] = frozenset()) -> State:
+        """By what fsspec tells. Raises InputError where a server gives no parts of files."""
+        if info.get("size") is None or info.get("partial") is False:
+            raise InputError(
+                "its server tells no size, or gives files as a whole only",
+                file=url,
+                remedy="download it, and name the local file",
+            )
+        known = info.get("ETag") or info.get("Last-Modified") or info.get("LastModified") or ""
+        return cls(int(info["size"]), str(known), hosts)
+
+    @classmethod
+    def held(cls, path: str | Path) -> State:
+        """What a stand-in holds."""
+        held = json.loads(Path(path).read_text())
+        return cls(int(held["size"]), str(held["content"]), frozenset(held.get("hosts", ())))
+
+    def put(self, place: Path) -> Path:
+        """Write a stand-in; returns its path."""
+        state = {"size": self.size, "content": self.content}
+        state |= {"hosts": sorted(self.hosts)} if self.hosts else {}
+        _put(place, (json.dumps(state) + "\n").encode())
+        return place
 
 
-def _look(url: str, hosts: frozenset[str] = frozenset()) -> str | None:
+def _look(url: str, hosts: frozenset[str] = frozenset()) -> State | None:
     """The state of a file; None if there is none. Raises InputError if nobody answers."""
     storage, name = (web_files(url, hosts), url) if _is_web(url) else bucket(url)
     try:
         info = ask_patiently(url, lambda: storage.info(name))
     except FileNotFoundError:
         return None
-    return None if info.get("type") == "directory" else _state(info, url, hosts)
+    return None if info.get("type") == "directory" else State.of(info, url, hosts)
 
 
 def _is_web(url: str) -> bool:
     return urlsplit(url).scheme in WEB
 
 
-# What clients fail with, by the names of their exceptions: the problem, the remedy, and whether
-# asking again may help. Clients of buckets ask again themselves.
-FAILURES = (
-    (
-        ("NoCredentialsError", "PartialCredentialsError", "ProfileNotFound"),
+# What clients fail with, by the names of their exceptions: the problem, and the remedy. Web servers
+# are asked again where nobody answers; clients of buckets do so themselves.
+NOBODY = "nobody answers there, or not to the end"
+ENVIRONMENT = "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+FAILURES = {
+    ("NoCredentialsError", "PartialCredentialsError", "ProfileNotFound"): (
         "no credentials for it",
-        "export AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or name a profile by AWS_PROFILE",
-        False,
+        f"export {ENVIRONMENT}, or name a profile by AWS_PROFILE",
     ),
-    (
-        ("gaierror", "ClientConnectorDNSError"),
+    ("gaierror", "ClientConnectorDNSError"): (
         "its host is unknown",
         "correct the URL or AWS_ENDPOINT_URL, and check the network",
-        False,
     ),
-    (
-        ("TooManyRedirects",),
+    ("TooManyRedirects",): (
         f"its server redirects more than {MOST_REDIRECTS} times",
         "check the URL",
-        False,
     ),
     (
-        ("EndpointConnectionError", "ConnectTimeoutError"),
-        "nobody answers there",
-        "check AWS_ENDPOINT_URL and the network, or try again later",
-        False,
-    ),
-    (
-        ("ClientConnectionError", "ClientPayloadError", "ClientResponseError", "TimeoutError"),
-        "nobody answers there, or not to the end",
-        "check the URL (or AWS_ENDPOINT_URL) and the network, or try again later",
-        True,
-    ),
-    (
-        ("PermissionError",),
+        *("EndpointConnectionError", "ConnectTimeoutError", "TimeoutError"),
+        *("ClientConnectionError", "ClientPayloadError", "ClientResponseError"),
+    ): (NOBODY, "check the URL (or AWS_ENDPOINT_URL) and the network, or try again later"),
+    ("PermissionError",): (
         "the server refuses access",
-        "check AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, which need the right to read and list",
-        False,
+        f"check {ENVIRONMENT}, which need the right to read and list",
     ),
-)
+}
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
@@ -206,18 +213,14 @@ def _failure(error: Exception, url: str) -> tuple[Exception, bool, float | None]
         if isinstance(link, Absent):
             return FileNotFoundError(url), False, None
     names = {kind.__name__ for link in chain for kind in type(link).__mro__}
-    for kinds, problem, remedy, again in FAILURES:
+    for kinds, (problem, remedy) in FAILURES.items():
         if names & set(kinds):
-            what = f"{problem} ({type(chain[-1]).__name__})" if again else problem
-            return InputError(what, file=url, remedy=remedy), again and _is_web(url), None
+            return InputError(problem, file=url, remedy=remedy), problem == NOBODY, None
     if isinstance(error, FileNotFoundError):
         return error, False, None
     said = "" if _is_web(url) else f": {error}"  # which may hold what a server redirects to
     problem = f"its server does not answer as it should ({type(error).__name__}{said})"
-    remedy = (
-        "try again later; check the URL, the credentials (AWS_ACCESS_KEY_ID …, with "
-        "the right to list) and AWS_ENDPOINT_URL"
-    )
+    remedy = f"try again later; check the URL, {ENVIRONMENT}, and AWS_ENDPOINT_URL"
     return InputError(problem, file=url, remedy=remedy), False, None
 
 
@@ -234,7 +237,7 @@ def ask_patiently(url: str, ask: Callable[[], Answer]) -> Answer:
         except Exception as error:  # clients raise what they like
             failure, again, asked_s = _failure(error, url)
         pause_s = WAIT_S * 2**number if asked_s is None else asked_s
-        if not again or time.monotonic() + pause_s > until:
+        if not (again and _is_web(url)) or time.monotonic() + pause_s > until:
             break
         time.sleep(pause_s)
     raise failure
@@ -259,29 +262,22 @@ def stand_in(url: str) -> Path:
     place = place_of(url)
     if (state := _look(url)) is None:
         raise _missing(url)
-    _put(place, state.encode())
-    return place
+    return state.put(place)
 
 
-def state_of(url: str, hosts: frozenset[str] = frozenset()) -> tuple[int, str] | None:
-    """Bytes of a file now, and what its server calls its content; None if there is none.
+def state_of(url: str, hosts: frozenset[str] = frozenset()) -> State | None:
+    """What a file is now; None if there is none.
 
     ``hosts`` that may be redirected to. Raises InputError for a URL that no stand-in can have, and
     if nobody answers.
     """
     place_of(url)
-    if (state := _look(url, hosts)) is None:
-        return None
-    held = json.loads(state)
-    return held["size"], held["content"]
+    return _look(url, hosts)
 
 
 def stand_in_of(url: str, size: int, content: str, hosts: frozenset[str]) -> Path:
     """The stand-in of a file that is known already, as by a list of tiles; nobody is asked."""
-    place = place_of(url)
-    info = {"size": size, "ETag": content}
-    _put(place, _state(info, url, hosts).encode())
-    return place
+    return State(size, content, hosts).put(place_of(url))
 
 
 def fetch(url: str) -> Path | None:
@@ -325,8 +321,8 @@ def ranges_reader(path: str | Path) -> Callable[[Ranges], list[bytes]]:
     It raises InputError if the file is another one by now than the stand-in says.
     """
     url = url_of(path) or ""
-    known = state_held(path)
-    storage, name = (web_files(url, hosts_of(path), *known), url) if _is_web(url) else bucket(url)
+    size, content, hosts = State.held(path)
+    storage, name = (web_files(url, hosts, size, content), url) if _is_web(url) else bucket(url)
 
     def ask(ranges: Ranges, held: dict[tuple[int, int], bytes]) -> None:
         """Add to ``held`` the ranges that it lacks. Raises the failure of one of them."""
@@ -388,7 +384,7 @@ def bring_files(url: str, suffixes: tuple[str, ...]) -> Path:
         )
     found = _listed(url)
     wanted = {
-        place_of(f"s3://{path}"): _state(info, f"s3://{path}")
+        place_of(f"s3://{path}"): State.of(info, f"s3://{path}")
         for path, info in found.items()
         if path.lower().endswith(suffixes) and info.get("type") != "directory"
     }
@@ -397,7 +393,7 @@ def bring_files(url: str, suffixes: tuple[str, ...]) -> Path:
         if file.is_file():
             file.unlink()
     for file, state in wanted.items():
-        _put(file, state.encode())
+        state.put(file)
     return place
 
 
@@ -413,32 +409,23 @@ def _listed(url: str) -> dict[str, dict[str, Any]]:
     return {info["name"]: info for info in listed}
 
 
-def _held(path: str | Path) -> dict[str, Any]:
-    return json.loads(Path(path).read_text())
-
-
-def state_held(path: str | Path) -> tuple[int, str]:
-    """Bytes of what a path stands for, and what its server calls its content."""
-    held = _held(path)
-    return int(held["size"]), str(held["content"])
-
-
 def hosts_of(path: str | Path) -> frozenset[str]:
     """The hosts, beside its own, that the server of what a path stands for may redirect to."""
-    return frozenset(_held(path).get("hosts", ())) if url_of(path) else frozenset()
+    return State.held(path).hosts if url_of(path) else frozenset()
 
 
 def size_of(path: str | Path) -> int:
     """Bytes of a file, or of what it stands for."""
-    path = Path(path)
-    return _held(path)["size"] if url_of(path) else path.stat().st_size
+    return State.held(path).size if url_of(path) else Path(path).stat().st_size
 
 
 def refuse_changed(path: str | Path) -> None:
     """Raise InputError if the file that a path stands for is another one by now."""
     url = url_of(path)
-    if url is not None and _look(url, hosts_of(path)) != Path(path).read_text():
-        raise changed(url)
+    if url is not None:
+        held = State.held(path)
+        if _look(url, held.hosts) != held:
+            raise changed(url)
 
 
 def gdal_name(path: str | Path) -> tuple[str, dict[str, str]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products import inputs
+from stereotruth.core.products import making as inputs
 from stereotruth.core.products.making import Checksums, checksum, marks, refuse_replaced, stamp
 
 
