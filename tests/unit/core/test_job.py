@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -24,16 +23,6 @@ def test_input_errors_are_one_line_in_any_alphabet(tmp_path, monkeypatch) -> Non
     assert "ERROR ingest ö: error: ü.laz: 5° − 3 × 2. Remedy: → другой" in log.read_text("utf-8")
 
 
-def test_panics_of_libraries_are_logged(tmp_path) -> None:
-    """Those of Rust are no Exception; the log was empty."""
-    panic = type("PanicException", (BaseException,), {})
-    with pytest.raises(panic), job(tmp_path / "a.log", "ingest"):
-        raise panic("index out of bounds")
-    text = (tmp_path / "a.log").read_text("utf-8")
-    assert "unexpected failure" in text
-    assert "index out of bounds" in text
-
-
 def test_a_file_that_is_taken_away_is_one_sentence(tmp_path, capsys) -> None:
     log = tmp_path / "a.log"
     with pytest.raises(SystemExit), job(log, "refine"):
@@ -44,44 +33,15 @@ def test_a_file_that_is_taken_away_is_one_sentence(tmp_path, capsys) -> None:
     assert f"ERROR {line}" in text and "Traceback" in text  # for whoever looks for a defect
 
 
-def test_secrets_of_urls_are_not_logged(tmp_path, capsys) -> None:
+def test_a_defect_is_logged_without_secrets_of_urls(tmp_path, capsys) -> None:
+    """Panics of libraries in Rust are no Exception."""
     log = tmp_path / "a.log"
-    with pytest.raises(RuntimeError), job(log, "ingest") as lines:
+    with pytest.raises(BaseException, match="host"), job(log, "ingest") as lines:
         lines.info("reads https://me:hunter2@host/a")
-        raise RuntimeError("https://host/a?X-Amz-Signature=hunter2")
+        raise type("PanicException", (BaseException,), {})("https://host/a?X-Amz-Signature=hunter2")
     said = capsys.readouterr().err
     assert "hunter2" not in log.read_text("utf-8") + said and said.count("host/a") >= 2
-
-
-def test_freed_memory_is_used_again(tmp_path) -> None:
-    """What follows a block of 64 MiB (16384 pages) costs no page of the system's within a job."""
-    if not hasattr(ctypes.CDLL(None), "mallopt"):
-        pytest.skip("another C library than glibc")
-    lines = (
-        "import ctypes, resource, sys",
-        "from stereotruth.core.job import job",
-        "c, size = ctypes.CDLL(None), ctypes.c_size_t(64 << 20)",
-        "c.malloc.restype = ctypes.c_void_p",
-        "def faults():",
-        "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt",
-        "    block = ctypes.c_void_p(c.malloc(size))",
-        "    c.memset(block, 1, size)",
-        "    c.free(block)",
-        "    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before",
-        "usual = [faults() for _ in range(3)]",
-        "with job(sys.argv[1], 'a'):",
-        "    faults()",
-        "    print(*usual, faults())",
-    )
-    call = [sys.executable, "-c", "\n".join(lines), str(tmp_path / "a.log")]
-    *usual, kept = map(int, subprocess.run(call, capture_output=True, check=True).stdout.split())
-    assert kept < min(usual) / 10
-
-
-def test_an_interrupt_is_no_failure(tmp_path) -> None:
-    with pytest.raises(KeyboardInterrupt), job(tmp_path / "a.log", "ingest"):
-        raise KeyboardInterrupt
-    assert (tmp_path / "a.log").read_text("utf-8") == ""
+    assert "unexpected failure" in log.read_text("utf-8")
 
 
 def test_work_in_a_process_of_its_own_returns_and_raises(tmp_path) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from datetime import UTC, date, datetime
+
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.tables import Table
+from stereotruth.core.tables import Table, acquisition_time, decimal_number
 
 
 def read(tmp_path, content: str | bytes, separators: str = ",;\t", ragged: bool = False) -> Table:
@@ -75,3 +77,21 @@ def test_a_table_that_is_not_there_and_a_number_that_is_none_are_refused(tmp_pat
     table = read(tmp_path, "id,x\nA,1 5\n")
     with pytest.raises(InputError, match=r"a\.csv: line 2: x '1 5'"):
         table.number_of(table.rows[0][1], "x", 2)
+
+
+def test_what_counts_as_a_number() -> None:
+    for text in ("0", "-0.5", "+1.25E-03", "5.", ".5", "1e5", "007"):
+        assert decimal_number(text) == float(text)
+    for text in ("", "1_000", "１２３", "٣", "nan", "inf", "0x10", "1,5", "1 0", "--1", "1" * 400):
+        with pytest.raises(ValueError):
+            decimal_number(text)
+
+
+def test_times_of_images_are_in_utc():
+    day = datetime(2020, 10, 25, 3, 12, 45, tzinfo=UTC)
+    assert acquisition_time("2020-10-25") == date(2020, 10, 25)
+    for text in ("2020-10-25T03:12:45Z", "2020-10-25 11:12:45+08:00"):
+        assert acquisition_time(text) == day
+    for text in ("2020-10-25T03:12:45", "25.10.2020", "2020-13-25", "2020-10-25T03:12 CST"):
+        with pytest.raises(ValueError):
+            acquisition_time(text)

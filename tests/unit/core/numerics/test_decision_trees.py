@@ -47,20 +47,8 @@ def test_a_tree_is_followed_to_its_leaf(tmp_path, features, expected):
 def test_a_table_that_was_saved_is_the_same(tmp_path):
     saved = sums(tmp_path)
     DecisionTrees.save(tmp_path / "again.tsv", saved)
-    loaded = DecisionTrees.load(tmp_path / "again.tsv")
-    for before, after in zip(saved, loaded, strict=True):
-        for one, other in zip(before, after):
-            assert np.array_equal(one, other)
-            assert one.dtype == other.dtype
-
-
-def test_no_pixel_changes_another(tmp_path):
-    rng = np.random.default_rng(0)
-    features = rng.normal(0.0, 3.0, (2, 1000)).astype(np.float32)
-    of, _ = sums(tmp_path)
-    whole = of.sum_at(features)
-    assert np.array_equal(whole[::7], of.sum_at(features[:, ::7]))
-    assert of.sum_at(features[:, :0]).shape == (0,)
+    for before, after in zip(saved, DecisionTrees.load(tmp_path / "again.tsv"), strict=True):
+        assert all(np.array_equal(one, other) for one, other in zip(before, after))
 
 
 def grown(rng: np.random.Generator, leaves: int) -> list[tuple[int, float, int, int, float]]:
@@ -100,6 +88,7 @@ def test_trees_of_any_form_are_followed() -> None:
     features[np.random.default_rng(2).uniform(size=features.shape) < 0.1] = np.nan
     expected = [followed(of, pixel) for pixel in features.T]
     assert of.sum_at(features).tolist() == expected
+    assert of.sum_at(features[:, ::7]).tolist() == expected[::7]
 
 
 def test_a_tree_of_too_many_leaves_is_refused() -> None:

@@ -1,6 +1,9 @@
+"""Grid stores that are whole or absent, and whose damage is told."""
+
 from __future__ import annotations
 
 import random
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -8,15 +11,15 @@ import xarray as xr
 import zarr
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.grids import (
     Layer,
     atomic_store,
-    blocks,
     create_grid,
+    damaged_store,
     open_grid,
     require_complete,
 )
+from stereotruth.core.products.making import making
 from stereotruth.core.products.resumable_grids import resumable_grid
 
 LAYERS = {"disparity": Layer("float32", float("nan"), {"units": "px", "long_name": "disparity"})}
@@ -36,10 +39,7 @@ def test_a_finished_grid_opens_by_xarray_alone(tmp_path):
         values = grid.disparity.values
     assert np.isnan(values).sum() == 70 * 100 - 32 * 32
     assert (values[32:64, :32] == 5).all()
-
-
-def test_it_is_zarr_3_and_sharded(tmp_path):
-    array = zarr.open_group(make(tmp_path / "d.zarr"), mode="r")["disparity"]
+    array = zarr.open_group(tmp_path / "d.zarr", mode="r")["disparity"]
     assert array.metadata.zarr_format == 3
     assert (array.chunks, array.shards) == ((16, 16), (32, 32))
 
@@ -53,42 +53,10 @@ def test_a_failed_build_leaves_nothing(tmp_path):
 
 def test_a_half_written_store_is_never_taken_for_a_whole_one(tmp_path):
     create_grid(tmp_path / "d.zarr", (8, 8), LAYERS, chunk=8, shard=8, attrs={})
-    with pytest.raises(InputError, match=r"d\.zarr.*half-written"):
-        open_grid(tmp_path / "d.zarr")
-    with pytest.raises(InputError, match="no such"):
-        open_grid(tmp_path / "other.zarr")
-
-
-def test_blocks_cover_a_grid_once():
-    seen = np.zeros((70, 100), int)
-    for window in blocks(seen.shape, 32):
-        seen[window] += 1
-    assert (seen == 1).all()
-
-
-def test_shards_must_hold_whole_chunks(tmp_path):
-    with pytest.raises(ValueError, match="multiple"):
-        create_grid(tmp_path / "d.zarr", (8, 8), LAYERS, chunk=5, shard=8, attrs={})
-
-
-def test_a_file_appears_when_it_is_whole(tmp_path):
-    path = tmp_path / "new" / "a.json"
-    with atomic_file(path) as scratch:
-        scratch.write_text("{}")
-        assert scratch.suffix == ".json"
-        assert not path.exists()
-    assert path.read_text() == "{}"
-    assert list(path.parent.iterdir()) == [path]
-
-
-def test_a_failed_write_leaves_what_was_there(tmp_path):
-    path = tmp_path / "a.json"
-    path.write_text("old")
-    with pytest.raises(RuntimeError), atomic_file(path) as scratch:
-        scratch.write_text("half")
-        raise RuntimeError
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
+    for name in ("d.zarr", "other.zarr"):
+        with pytest.raises(InputError) as refused:
+            open_grid(tmp_path / name)
+        assert refused.value.file == str(tmp_path / name)
 
 
 def test_a_grid_is_made_and_published_where_there_are_no_hard_links(tmp_path, monkeypatch):
@@ -139,3 +107,21 @@ def test_a_flipped_bit_of_a_chunk_is_never_read_as_another_value(tmp_path):
             require_complete(path)["disparity"][:]
         flip(file, bit)
     assert require_complete(path)["disparity"][40, 8] == 5
+
+
+@pytest.mark.parametrize("file", ["disparity/c/1/0", "x/c/0"])
+def test_a_job_that_reads_a_damaged_chunk_names_the_store(tmp_path, monkeypatch, file):
+    good, bad = make(tmp_path / "a.zarr"), make(tmp_path / "b.zarr")
+    flip(bad / file, (bad / file).stat().st_size * 8 // 3)
+    (tmp_path / "gcps.csv").touch()
+    inputs = [str(tmp_path / "gcps.csv"), str(good), str(bad)]
+    monkeypatch.chdir(tmp_path)
+    with (
+        pytest.raises(InputError) as refused,
+        making(inputs, ["out.txt"]),
+        ThreadPoolExecutor(1) as pool,
+    ):
+        pool.submit(lambda: require_complete(bad)[file.partition("/")[0]][:]).result()
+    assert (refused.value.file, bool(refused.value.remedy)) == (str(bad), True)
+    assert damaged_store(refused.value.__cause__, [good]) is None
+    assert damaged_store(ValueError("a defect"), [bad]) is None
