@@ -1,6 +1,8 @@
-"""What a new project holds."""
+"""What a new project holds, and copies of profiles."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 import yaml
@@ -8,21 +10,29 @@ from typer.testing import CliRunner
 
 from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.errors import InputError
-from stereotruth.core.sheets import read_cities, read_scenes
 from stereotruth.project.main import app
-from stereotruth.project.new_project import KEYS, begin, configuration_text
-from stereotruth.project.project import configured
+from stereotruth.project.new_project import (
+    KEYS,
+    SHIPPED,
+    begin,
+    configuration_text,
+    copy_profile,
+    list_profiles,
+)
+from stereotruth.project.project import FILES, configured, read_rows
 
 
 def test_a_new_project_is_read_and_empty(tmp_path, monkeypatch):
-    begin(tmp_path / "new")
-    monkeypatch.chdir(tmp_path / "new")
+    """In the folder where one is, too; nothing is written over."""
+    monkeypatch.chdir(tmp_path)
+    run = CliRunner().invoke(app, ["init", "."])
+    assert run.exit_code == 0 and "Next: stereotruth scene add" in run.output
     settings, files = configured()
-    assert files == "config.yaml"
-    assert settings.scenes == "scenes.tsv"
-    cities = read_cities(settings.cities)
-    assert cities == {} and read_scenes(settings.scenes, cities) == {}
-    assert (tmp_path / "new" / "gcps").is_dir()
+    assert files == "config.yaml" and settings.scenes == "scenes.tsv"
+    assert read_rows(settings) == ({}, {}, {}) and Path("gcps").is_dir()
+    for folder in (tmp_path, ""):
+        with pytest.raises(InputError):
+            begin(folder)
 
 
 def test_what_is_commented_are_the_defaults():
@@ -36,17 +46,15 @@ def test_what_is_commented_are_the_defaults():
     assert Configuration.of(values) == Configuration.of(sheets)
 
 
-def test_nothing_is_written_over(tmp_path):
-    (tmp_path / "mine.txt").write_text("kept")
-    with pytest.raises(InputError, match="not empty"):
-        begin(tmp_path)
-    assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
-
-
-def test_the_folder_where_one_is_may_be_the_project(tmp_path, monkeypatch):
+def test_profiles_are_listed_and_copied_once(tmp_path, monkeypatch):
+    folders = {folder.name for folder in (FILES / "profiles").iterdir() if folder.is_dir()}
+    assert set(SHIPPED) == folders
+    assert [line.split()[0] for line in list_profiles()[: len(SHIPPED)]] == list(SHIPPED)
     monkeypatch.chdir(tmp_path)
-    run = CliRunner().invoke(app, ["init", "."])
-    assert run.exit_code == 0 and "Next: stereotruth scene add" in run.output
-    assert (tmp_path / "config.yaml").is_file()
-    with pytest.raises(InputError, match="no folder is named"):
-        begin("")
+    said = copy_profile("slurm", Path("my-site"))
+    assert said.endswith("stereotruth run --profile my-site -n")
+    shipped = FILES / "profiles" / "slurm" / "config.yaml"
+    assert Path("my-site/config.yaml").read_bytes() == shipped.read_bytes()
+    for name in ("slurm", "slrum"):
+        with pytest.raises(InputError):
+            copy_profile(name, Path("my-site"))

@@ -11,13 +11,15 @@ import pytest
 from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.config.section import merged
 from stereotruth.core.errors import InputError
-from stereotruth.core.sheets import Image, Scene
+from stereotruth.core.sheets import City, Image, Scene
+from stereotruth.lidar.frames import DEFAULT_EPOCH
 from stereotruth.project.project import (
     FILES,
     adjusted_scenes,
     check_fixed,
     configured,
     days_of_pair,
+    epoch_of_city,
     read_mapping,
     read_scenes,
     stores_of,
@@ -44,58 +46,30 @@ def test_files_of_the_folder_lie_over_the_defaults(tmp_path, monkeypatch):
     assert (settings.seed, settings.strict, settings.tiles.size) == (3, True, 1024)
 
 
-@pytest.mark.parametrize("text", ["a: [", "- a\n- b\n", "seed: x\n"])
-def test_a_wrong_file_is_named(tmp_path, monkeypatch, text):
-    monkeypatch.chdir(tmp_path)
-    Path("config.yaml").write_text(text)
-    with pytest.raises(InputError, match=r"config\.yaml"):
-        configured()
+NINES = [", ".join([f"*a{n}"] * 9) for n in range(12)]
+NO_MAPPINGS = {
+    "half": b"a: [",
+    "a list": b"- a\n- b\n",
+    "UTF-16": "seed: 1\n".encode("utf-16"),
+    "aliases": "a0: &a0 [x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{NINES[n]}]\n" for n in range(11)),
+    "merged": "a0: &a0 {x: 1}\n"
+    + "".join(f"a{n + 1}: &a{n + 1} {{<<: [{NINES[n]}]}}\n" for n in range(11)),
+    "a circle": "a: &a [1, *a]\n",
+    "deep": "a: " + "[" * 5000 + "]" * 5000,
+    "large": "a: x" + "x" * 1_000_000,
+    "twice": "tiles: {size: 256}\nseed: 1\ntiles: {stride: 3}\n",
+    "twice inside": "tiles: {size: 256, size: 512}\n",
+}
 
 
-def test_synthetic_cities_are_known_in_any_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    cities, scenes = read_scenes(Configuration())
-    assert "Qichun" in cities
-    assert scenes["Qichun-1"].gcps == str(FILES / "config/gcps/Qichun-1.csv")
-    with pytest.raises(InputError, match=r"mine\.tsv"):
-        read_scenes(Configuration(cities="mine.tsv"))
-
-
-def test_utf_16_is_named(tmp_path):
-    file = tmp_path / "c.yaml"
-    file.write_text("seed: 1\n", encoding="utf-16")
-    with pytest.raises(InputError, match=r"c\.yaml: is no UTF-8"):
-        read_mapping(file)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "".join(
-            [
-                "a0: &a0 [x, x, x, x, x, x, x, x, x]\n",
-                *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 12)),
-            ]
-        ),
-        "".join(
-            [
-                "a0: &a0 {x: 1}\n",
-                *(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 9)}]}}\n" for n in range(1, 12)),
-            ]
-        ),
-        "a: &a [1, *a]\n",
-        "a: " + "[" * 5000 + "]" * 5000,
-        "a: x" + "x" * 1_000_000,
-    ],
-    ids=["aliases", "merged", "circle", "deep", "large"],
-)
-def test_what_grows_beyond_measure_is_refused_at_once(tmp_path, text):
-    file = tmp_path / "c.yaml"
-    file.write_text(text)
+@pytest.mark.parametrize("kind", NO_MAPPINGS)
+def test_what_is_no_mapping_is_refused_at_once(tmp_path, kind):
+    text = NO_MAPPINGS[kind]
+    (tmp_path / "c.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
     begun = time.process_time()
-    with pytest.raises(InputError, match=r"c\.yaml: (more than 200000 values|is nested|.* MB)"):
-        read_mapping(file)
-    assert time.process_time() - begun < 5
+    with pytest.raises(InputError, match=r"c\.yaml") as refused:
+        read_mapping(tmp_path / "c.yaml")
+    assert refused.value.remedy and time.process_time() - begun < 5
 
 
 def test_aliases_that_do_not_multiply_are_taken(tmp_path):
@@ -104,43 +78,11 @@ def test_aliases_that_do_not_multiply_are_taken(tmp_path):
     assert read_mapping(file) == {"a": {"b": 1}, "c": {"b": 1}, "d": {"b": 1, "e": 2}}
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (
-            "tiles: {size: 256}\nseed: 1\ntiles: {stride: 3}\n",
-            "'tiles' stands twice, in lines 1 and 3",
-        ),
-        ("tiles:\n  size: 256\n  size: 512\n", "'size' stands twice, in lines 2 and 3"),
-    ],
-)
-def test_a_key_that_stands_twice_is_refused_with_both_lines(tmp_path, text, words):
-    (tmp_path / "my.yaml").write_text(text)
-    with pytest.raises(InputError, match=words):
-        read_mapping(tmp_path / "my.yaml")
-
-
-def test_a_lidar_file_is_read_once_for_the_scenes_that_take_it_alike():
-    row = {"left_image": "l.tif", "right_image": "r.tif", "lidar": "lidar", "gcps": ""}
-    how = {"lidar_crs": "", "geoid": ""}
-    scenes = {
-        name: Scene(scene=name, **row | {"city": "A"} | how | changes)
-        for name, changes in {
-            "A-2": {},
-            "A-1": {},
-            "A-3": {"geoid": "g.gtx"},
-            "A-4": {"lidar_crs": "EPSG:32650"},
-            "B-1": {"city": "B"},
-        }.items()
-    }
-    files = {"one": Path("lidar/one.laz"), "two": Path("lidar/two.laz")}
-    lidar = {name: dict(files) for name in scenes}
-    lidar["A-1"] = {"one-1a2b": Path("lidar/../lidar/one.laz"), "three": Path("three.laz")}
-    found = stores_of(scenes, lidar)
-    assert found["A-2"] == [("A-2", "one"), ("A-2", "two")]
-    assert found["A-1"] == [("A-2", "one"), ("A-1", "three")]
-    for name in ("A-3", "A-4", "B-1"):
-        assert found[name] == [(name, "one"), (name, "two")]
+def test_synthetic_cities_are_known_in_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cities, scenes = read_scenes(Configuration())
+    assert "Qichun" in cities
+    assert scenes["Qichun-1"].gcps == str(FILES / "config/gcps/Qichun-1.csv")
 
 
 def scenes_of_town(*pairs: str) -> dict[str, Scene]:
@@ -149,6 +91,21 @@ def scenes_of_town(*pairs: str) -> dict[str, Scene]:
         pair: Scene(pair, "Town", f"{pair[0]}.tif", f"{pair[1]}.tif", "lidar", "", "", "")
         for pair in pairs
     }
+
+
+def test_a_lidar_file_is_read_once_for_the_scenes_that_take_it_alike():
+    scenes = scenes_of_town("AB", "CD", "EF", "GH", "IJ")
+    scenes["EF"] = replace(scenes["EF"], geoid="g.gtx")
+    scenes["GH"] = replace(scenes["GH"], lidar_crs="EPSG:32650")
+    scenes["IJ"] = replace(scenes["IJ"], city="Other")
+    files = {"one": Path("lidar/one.laz"), "two": Path("lidar/two.laz")}
+    lidar = {name: dict(files) for name in scenes}
+    lidar["CD"] = {"one-1a2b": Path("lidar/../lidar/one.laz"), "three": Path("three.laz")}
+    found = stores_of(scenes, lidar)
+    assert found["AB"] == [("AB", "one"), ("AB", "two")]
+    assert found["CD"] == [("AB", "one"), ("CD", "three")]
+    for name in ("EF", "GH", "IJ"):
+        assert found[name] == [(name, "one"), (name, "two")]
 
 
 def test_scenes_that_share_an_image_are_adjusted_together():
@@ -162,7 +119,7 @@ def test_scenes_that_share_an_image_are_adjusted_together():
     assert found == {"AB": ("one", "two"), "BC": ("two", "C.tif")}
 
 
-def test_fixed_alignments_and_images_decide_what_is_adjusted():
+def test_fixed_alignments_and_images_decide_what_is_adjusted(tmp_path):
     scenes = scenes_of_town("AB", "BC", "DE")
     names = {pair: (pair[0], pair[1]) for pair in scenes}
 
@@ -174,37 +131,49 @@ def test_fixed_alignments_and_images_decide_what_is_adjusted():
     assert adjusted(fixed={"D": "site.json"}) == {"AB", "BC", "DE"}
     assert adjusted(refine=False) == set()
 
-
-def test_what_is_fixed_is_a_scene_or_an_image_with_a_file(tmp_path):
-    file = tmp_path / "kept.json"
-    file.write_text("{}")
-    scenes = scenes_of_town("AB")
-
-    def check(name: str, path: str) -> None:
-        settings = Configuration.of({"alignment": {"fixed": {name: path}}})
-        check_fixed(settings, scenes, {"A": None})
-
-    check("A", str(file))
-    check("AB", str(file))
-    with pytest.raises(InputError, match="no such scene or image"):
-        check("Z", str(file))
-    with pytest.raises(InputError, match="no such file"):
-        check("A", "nowhere.json")
+    (tmp_path / "kept.json").write_text("{}")
+    for name, file, good in (
+        ("A", "kept.json", True),
+        ("AB", "kept.json", True),
+        ("Z", "kept.json", False),
+        ("A", "nowhere.json", False),
+    ):
+        settings = Configuration.of({"alignment": {"fixed": {name: str(tmp_path / file)}}})
+        if good:
+            check_fixed(settings, scenes, {"A": None})
+        else:
+            with pytest.raises(InputError):
+                check_fixed(settings, scenes, {"A": None})
 
 
-@pytest.mark.parametrize(
-    ("names", "days"),
-    [
-        (("l", "r"), ("2020-10-25", "2020-10-26")),
-        (("r", ""), ("2020-10-26", "")),  # a file that the sheet does not have
-        (("n", "l"), ("", "2020-10-25")),
-    ],
-)
-def test_days_of_a_pair_are_those_of_the_images_sheet(names, days):
+def test_days_of_a_pair_are_those_of_the_images_sheet():
     """UTC, whatever the zone."""
     acquired = {"l": "2020-10-26T03:12:45+08:00", "r": "2020-10-26", "n": ""}
     images = {
         name: Image(image=name, city="A", file=f"{name}.tif", acquired=cell)
         for name, cell in acquired.items()
     }
-    assert days_of_pair(names, images) == days
+    assert days_of_pair(("l", "r"), images) == ("2020-10-25", "2020-10-26")
+    assert days_of_pair(("r", ""), images) == ("2020-10-26", "")  # one that the sheet has not
+    assert days_of_pair(("n", "l"), images) == ("", "2020-10-25")
+
+
+def test_the_epoch_of_a_city_is_that_of_the_first_images_that_tell_their_day(tmp_path):
+    town = City("Town", "TN", 6, 1, 3)
+    scenes = {
+        name: replace(scene, left_image=str(tmp_path / "l.tif"), right_image=str(tmp_path / file))
+        for (name, scene), file in zip(scenes_of_town("AB", "CD").items(), ("r.tif", "B.tif"))
+    }
+    assert epoch_of_city(town, scenes, {}) == DEFAULT_EPOCH
+    (tmp_path / "B.imd").write_text("firstLineTime = 2019-07-02T03:12:45.000000Z;\n")
+    found = epoch_of_city(town, scenes, {})
+    assert (found.year, found.by) == (pytest.approx(2019.5, abs=0.002), "the images of scene CD")
+    days = {"l": "2020-07-01", "r": "2021-07-02"}
+    rows = {
+        name: Image(name, "Town", str(tmp_path / f"{name}.tif"), day) for name, day in days.items()
+    }
+    found = epoch_of_city(town, scenes, rows)
+    assert (found.year, found.by) == (pytest.approx(2021.0, abs=0.002), "the images of scene AB")
+    assert epoch_of_city(replace(town, epoch="2016.4"), scenes, rows).year == 2016.4
+    other = {name: replace(one, city="Other") for name, one in scenes.items()}
+    assert epoch_of_city(town, other, rows) == DEFAULT_EPOCH

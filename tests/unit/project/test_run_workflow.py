@@ -1,27 +1,88 @@
-"""Arguments of Snakemake, and the status line."""
+"""What a run can make, typos of it, and the arguments of Snakemake."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import re
 from pathlib import Path
 
 import pytest
 
 from stereotruth.core.errors import InputError
+from stereotruth.project.check import check_project
 from stereotruth.project.new_project import copy_profile
 from stereotruth.project.project import FILES, configured
 from stereotruth.project.run_workflow import (
-    TRUSTED,
-    Progress,
+    TARGETS,
     arguments_for,
     config_files,
-    duration,
-    follow,
+    list_targets,
+    need_scenes,
+    refuse_unknown,
+    rules,
     run_workflow,
 )
+from stereotruth.project.status import show_status
 
 SNAKEFILE = ["--snakefile", str(FILES / "Snakefile")]
+
+
+@pytest.fixture
+def empty(tmp_path, monkeypatch) -> Path:
+    """A folder whose configuration says nothing."""
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").touch()
+    return tmp_path
+
+
+def test_targets_are_listed_with_the_names_of_the_project(folder):
+    lines = list_targets()
+    assert [line.split()[0] for line in lines[: len(TARGETS)]] == list(TARGETS)
+    assert "<City>: Good" in lines and "<scene>: Good-1" in lines
+
+
+def test_each_target_is_what_a_rule_makes():
+    files = sorted((FILES / "workflow" / "rules").glob("*.smk"))
+    text = "".join(file.read_text(encoding="utf-8") for file in files)
+    for target in TARGETS:
+        path = re.sub(r"<(\w+)>", lambda found: f"{{{found[1].lower()}}}", target)
+        path = path.removesuffix(".zarr")  # of either side
+        assert f'"{path}' in text if "/" in path else path in rules(), target
+
+
+def test_a_typo_is_told_with_what_it_may_mean(folder):
+    for word, meant in (
+        ("reprot", "report"),
+        ("tiles/Goood", "tiles/Good"),
+        ("results/report/Goood/index.html", "results/report/Good/index.html"),
+        ("benchmark/syntetic/sgm", "benchmark/synthetic/sgm"),
+    ):
+        with pytest.raises(InputError, match=f"did you mean {meant}"):
+            refuse_unknown([word, "--cores", "2"])
+    refuse_unknown(["report", "tiles/Good", "results/x.json", "--forcerun", "anything"])
+    refuse_unknown(["results/closure/Good.json", "results/training_cities/cities/1"])
+
+
+def test_targets_of_named_datasets_need_no_scenes(empty):
+    for targets, needed in (
+        ([], True),
+        (["report", "-n"], True),
+        (["benchmark/us3d/sgm", "audit/us3d/", "-n"], False),
+        (["benchmark/us3d/sgm", "dataset"], True),
+        (["training_cities"], False),
+        (["benchmark"], True),  # a built-in dataset is among them
+    ):
+        assert need_scenes(targets) == needed
+    own = "benchmark: {datasets: {a: {root: a, layout: us3d, disparity_range: [0, 9]}}}"
+    Path("config.yaml").write_text(own)
+    assert not need_scenes(["benchmark"])
+
+
+def test_a_folder_without_a_sheet_of_scenes_has_no_built_in_cities(empty):
+    assert not any(line.startswith(("<City>:", "<scene>:")) for line in list_targets())
+    for ask in (lambda: run_workflow(["--cores", "1"]), lambda: show_status([], None)):
+        with pytest.raises(InputError, match="names no sheet of scenes"):
+            ask()
+    assert check_project()[-1][-1].text == "config.yaml: names no sheet of scenes"
 
 
 @pytest.mark.parametrize(
@@ -29,118 +90,45 @@ SNAKEFILE = ["--snakefile", str(FILES / "Snakefile")]
     [
         (["tiles/A"], ["tiles/A", "--configfile", "config.yaml", "--cores", "all"]),
         (["tiles/A", "-c2"], ["tiles/A", "-c2", "--configfile", "config.yaml"]),
-        (["--jobs=3"], ["--jobs=3", "--configfile", "config.yaml"]),
-        (["--configfile", "b.yaml"], ["--configfile", "b.yaml", "--cores", "all"]),
         (["--configfile=b.yaml"], ["--configfile=b.yaml", "--cores", "all"]),
         (["a", "--", "-k"], ["a", "-k", "--configfile", "config.yaml", "--cores", "all"]),
         (["--profile", "p"], ["--profile", "p", "--configfile", "config.yaml"]),
-        (["--config", "seed=1"],
-         ["--config", "seed=1", "--configfile", "config.yaml", "--cores", "all"]),
     ],
-)  # fmt: skip
-def test_options_are_passed_on(tmp_path, monkeypatch, given, passed):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "config.yaml").touch()
+)
+def test_options_are_passed_on(empty, given, passed):
     assert arguments_for(given) == [*SNAKEFILE, *passed]
 
 
-def test_a_profile_of_the_package_is_named_without_its_path(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "config.yaml").touch()
+def test_a_profile_of_the_package_is_named_without_its_path(empty, monkeypatch):
     shipped = str(FILES / "profiles" / "default")
     assert arguments_for(["--profile", "default"])[2:4] == ["--profile", shipped]
     assert arguments_for(["--profile=default"])[2] == f"--profile={shipped}"
     assert arguments_for(["--profile", "my-site"])[3] == "my-site"
     monkeypatch.setattr("stereotruth.project.run_workflow.find_spec", lambda name: None)
-    with pytest.raises(InputError, match="pip install snakemake-executor-plugin-slurm"):
-        arguments_for(["--profile", "slurm"])
-    with pytest.raises(InputError, match="pip install snakemake-storage-plugin-s3"):
-        arguments_for(["--profile", "s3"])
     copy_profile("slurm", Path("my-site"))
-    with pytest.raises(InputError, match="'my-site' needs the package snakemake-executor-plugin"):
-        arguments_for(["--profile", "my-site"])
+    for name, plugin in (("slurm", "executor-plugin-slurm"), ("my-site", "executor"), ("s3", "s3")):
+        with pytest.raises(InputError, match=plugin):
+            arguments_for(["--profile", name])
 
 
-def test_the_built_in_cities_are_asked_for_by_name(tmp_path, monkeypatch):
+def test_the_built_in_cities_are_asked_for_by_name(empty, monkeypatch):
     """In a folder of a project the message says where the project is."""
-    (tmp_path / "config.yaml").touch()
-    inside = tmp_path / "tiles" / "A"
+    inside = empty / "tiles" / "A"
     inside.mkdir(parents=True)
     monkeypatch.chdir(inside)
-    with pytest.raises(InputError, match=r"no config\.yaml here.*did you mean: cd \.\./\.\."):
-        arguments_for(["tiles/A"])
-    with pytest.raises(InputError, match=r"no config\.yaml here"):
-        configured()
-    assert arguments_for(["--example", "tiles/Qichun", "-j1"]) == [
-        *SNAKEFILE, "tiles/Qichun", "-j1"
-    ]  # fmt: skip
+    for ask in (lambda: arguments_for(["tiles/A"]), configured):
+        with pytest.raises(InputError, match=r"cd \.\./\.\."):
+            ask()
+    own = ["--example", "tiles/Qichun", "-j1"]
+    assert arguments_for(own) == [*SNAKEFILE, "tiles/Qichun", "-j1"]
 
 
-RUN = """\
-Job stats:
-job        count
--------  -------
-align          1
-project        3
-total          4
-
-Select jobs to execute...
-Finished jobid: 3 (Rule: align)
-1 of 4 steps (25%) done
-Finished jobid: 2 (Rule: project)
-2 of 4 steps (50%) done
-"""
-
-
-def test_time_left_follows_from_the_jobs_that_are_done():
-    progress = Progress(begun=100.0)
-    assert progress.line(100.0) == "planning"
-    planned = 3 + 3 * 8  # SECONDS of align and project
-    lines = RUN.splitlines()
-    for line in lines[:7]:
-        progress.read(line)
-    assert progress.line(100.0) == f"0 of 4 jobs done, about {planned} s left"
-    for line in lines[7:]:
-        progress.read(line)
-    done = 3 + 8
-    left = (planned - done) * (36 + TRUSTED) / (done + TRUSTED)
-    assert progress.seconds_left(136.0) == pytest.approx(left)
-    assert progress.line(136.0) == f"2 of 4 jobs done, about {left:.0f} s left"
-    progress.read("4 of 4 steps (100%) done")
-    assert progress.line() == "4 of 4 jobs done"
-
-
-@pytest.mark.parametrize(("seconds", "words"), [(5, "5 s"), (600, "10 min"), (7200, "2.0 h")])
-def test_durations(seconds, words):
-    assert duration(seconds) == words
-
-
-def test_the_files_of_the_configuration_are_found_among_the_arguments(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_files_of_the_configuration_are_found_and_read_before_the_run(empty):
     for name in ("a.yaml", "b.yaml", "c.yaml"):
         Path(name).touch()
     given = ["--configfile", "a.yaml", "b.yaml", "--cores", "2", "--configfiles=c.yaml", "tiles/X"]
     assert [file.name for file in config_files(given)] == ["a.yaml", "b.yaml", "c.yaml"]
     assert config_files(["--cores", "a.yaml"]) == []
-
-
-def test_a_configuration_that_is_no_utf_8_is_named_before_the_run(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     Path("config.yaml").write_text("seed: 1\n", encoding="utf-16")
     with pytest.raises(InputError, match=r"config\.yaml: is no UTF-8"):
         run_workflow(["--dry-run"])
-
-
-def test_after_ctrl_c_nothing_is_shown_but_how_to_carry_on(monkeypatch, capfd):
-    def watch(lines, progress):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("stereotruth.project.run_workflow.watch", watch)
-    program = "import sys; print('Traceback (most recent call last):'); sys.exit(3)"
-    run = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
-    assert follow(run) == 3
-    out, err = capfd.readouterr()
-    assert out == "" and err.splitlines() == [
-        "Stopping the jobs that are at work …",
-        "Stopped. The same command carries on.",
-    ]

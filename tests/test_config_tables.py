@@ -4,25 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import yaml
+from config_tables import defaults_text, with_tables
 
 from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.config.section import attributes_of, nested
-from stereotruth.project.config_tables import defaults_text, with_tables
 
-ROOT = Path(__file__).parents[3]
-REMEDY = "run: python -m stereotruth.project.config_tables"
+CONFIG = Path(__file__).parents[1] / "config"
+REMEDY = "run: python docs/config_tables.py"
 
 
 def test_the_file_of_defaults_follows_from_the_sections():
-    text = (ROOT / "config" / "config.yaml").read_text()
+    text = (CONFIG / "config.yaml").read_text()
     assert defaults_text() == text, REMEDY
     assert Configuration.of(yaml.safe_load(text)) == Configuration()
 
 
 def test_the_reference_follows_from_the_sections():
-    guide = (ROOT / "config" / "README.md").read_text()
+    guide = (CONFIG / "README.md").read_text()
     assert with_tables(guide) == guide, REMEDY
     assert guide.count("<!-- keys: ") == guide.count("<!-- end -->") == 5
 
@@ -36,6 +35,6 @@ def keys(of, before=""):
             yield from keys(inner, f"{before}{name}.")
 
 
-@pytest.mark.parametrize(("name", "key", "inner"), keys(Configuration), ids=lambda v: str(v)[:60])
-def test_every_key_says_what_it_is(name, key, inner):
-    assert key.meaning or inner is not None or name == "benchmark.methods.kind"
+def test_every_key_says_what_it_is():
+    silent = {name for name, key, inner in keys(Configuration) if inner is None and not key.meaning}
+    assert silent <= {"benchmark.methods.kind"}
