@@ -142,15 +142,6 @@ def test_a_pair_is_added_once_listed_and_removed(folder):
     assert (folder / "scenes.tsv").read_text() == before
 
 
-def test_lidar_elsewhere_is_refused(folder):
-    """The good LiDAR lies in zone 50; as zone 39 it is 66 degrees away."""
-    write_lidar(folder, system=None)
-    images = copied(folder, "a", "b")
-    with pytest.raises(InputError, match="degrees away from the images"):
-        add_scene(images, lidar="lidar", lidar_crs="EPSG:32639", city="Good")
-    assert len(list_scenes()) == 1
-
-
 @pytest.mark.parametrize(
     ("break_it", "options", "words"),
     [(lambda f: worldview(f / "d", 4), {}, "an image in 4 files"),
@@ -158,6 +149,8 @@ def test_lidar_elsewhere_is_refused(folder):
      (lambda f: plain(f / "d" / "a.tif", "left") and plain(f / "d" / "b.tif", "left"), {},
       "no RPC metadata"),
      (lambda f: gaofen(f / "d") and write_lidar(f, system=None), {}, "set --lidar-crs"),
+     (lambda f: gaofen(f / "d") and write_lidar(f, system=None), {"lidar_crs": "EPSG:32639"},
+      "degrees away from the images"),  # the good LiDAR lies in zone 50
      (lambda f: gaofen(f / "d"), {"lidar": "none"}, "no LiDAR file"),
      (lambda f: gaofen(f / "d"), {"gcps": "none.csv"}, "none.csv"),
      (lambda f: gaofen(f / "d"), {"name": "Good-1"}, "is there already")],

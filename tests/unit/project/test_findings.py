@@ -22,14 +22,6 @@ def test_refusals_and_warnings_are_findings():
     assert len(found) == 2  # said once
 
 
-def test_outside_of_a_block_nothing_is_heard():
-    found = Findings()
-    with found.of("images"):
-        pass
-    logging.getLogger("stereotruth").warning("unheard")
-    assert found == [] and not found.failed
-
-
 def test_what_is_found_of_several_scenes_stands_once():
     every = [Findings(name) for name in ("project", "A-1", "A-2", "A-3", "run")]
     for findings in every[1:4]:
