@@ -4,17 +4,13 @@ from pathlib import Path
 
 from stereotruth.align.site_adjustment import adjust_site
 from stereotruth.align.site_pair import ScenePair, write_site
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, file_sha256
 from stereotruth.lidar.frames import Epoch
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
-    with (
-        job(snakemake.log[0], f"adjust {city}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"adjust {city}"):
         pairs = [
             ScenePair(scene, left, right, Path(alignment), Path(equations), gcps or None)
             for (scene, (left, right, gcps)), alignment, equations in zip(

@@ -3,16 +3,12 @@
 from pathlib import Path
 
 from stereotruth.align.site_pair import ScenePair, pair_alignment, read_site, write_site
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, digest
 
 if __name__ == "__main__":
     scene, given = snakemake.wildcards.scene, snakemake.input
-    with (
-        job(snakemake.log[0], f"adjusted alignment {scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"adjusted alignment {scene}"):
         site = read_site(given.site)
         pair = ScenePair(
             scene, *snakemake.params.images, Path(given.alignment), Path(given.equations)

@@ -7,8 +7,7 @@ from stereotruth.align.align import align, from_rpcs
 from stereotruth.align.align_report import write_alignment
 from stereotruth.align.control_points import TooFewPoints, read_gcps
 from stereotruth.core.errors import InputError
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import describe
 from stereotruth.lidar.frames import Epoch
 
@@ -16,10 +15,7 @@ if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     model, strict = snakemake.params.model, snakemake.params.strict
     epoch = Epoch(*snakemake.params.epoch)
-    with (
-        job(snakemake.log[0], f"align {scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"align {scene}"):
         images = snakemake.input.left[0], snakemake.input.right[0]
         provenance = describe(
             snakemake.input, {"model": model, "epoch": [*epoch]}, snakemake.params.code

@@ -2,18 +2,14 @@
 
 from stereobench.audit.audit import audit
 from stereotruth.core.config.methods import Audit
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.report.index_page import write_index
 from stereotruth.pages.page import INDEX
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     name, params = snakemake.wildcards.dataset, snakemake.params
-    with (
-        job(snakemake.log[0], f"audit {name}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"audit {name}"):
         audit(
             StereoDataset.of(name, params.dataset),
             snakemake.output[0],

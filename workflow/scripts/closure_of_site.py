@@ -2,18 +2,14 @@
 
 from pathlib import Path
 
-from stereotruth.core.job import job
 from stereotruth.core.products.grids import require_complete
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import describe, digest, file_sha256
 from stereotruth.evaluate.closure import PairFiles, closure, write_closure
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
-    with (
-        job(snakemake.log[0], f"closure {city}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"closure {city}"):
         pairs, inputs = [], {}
         files = zip(given.disparity, given.alignments, given.equations)
         for (scene, images), paths in zip(snakemake.params.pairs.items(), files):

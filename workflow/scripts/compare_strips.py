@@ -3,17 +3,13 @@
 import logging
 from dataclasses import replace
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import describe, digest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
 
 if __name__ == "__main__":
-    with (
-        job(snakemake.log[0], f"compare_strips {snakemake.wildcards.scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"compare_strips {snakemake.wildcards.scene}"):
         stores = [PointStore(path) for path in snakemake.input.points]
         found = replace(compare_strips(stores), taken_out=snakemake.params.taken_out)
         if found.sentence:

@@ -1,16 +1,12 @@
 """All cities' tiles in the layout of the published dataset, and in others."""
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.tiles.other_layouts import write_layout
 from stereotruth.tiles.published_layout import assemble_dataset
 
 if __name__ == "__main__":
     dataset, *others = snakemake.output
-    with (
-        job(snakemake.log[0], "dataset"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, "dataset"):
         assemble_dataset(snakemake.input.tiles, dataset, **snakemake.params.catalogs)
         for layout, out in zip(snakemake.params.layouts, others, strict=True):
             write_layout(dataset, out, layout)

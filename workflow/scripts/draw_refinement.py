@@ -2,15 +2,11 @@
 
 from stereotruth.align.aligned_pair import Alignment
 from stereotruth.align.refine_figure import draw_refinement
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
     given = snakemake.input
-    with (
-        job(snakemake.log[0], f"draw refinement {snakemake.wildcards.scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"draw refinement {snakemake.wildcards.scene}"):
         draw_refinement(
             Alignment.load(given.alignment),
             given.observations,

@@ -2,12 +2,8 @@
 
 from stereotruth.align.align_figure import draw_residuals
 from stereotruth.align.aligned_pair import Alignment
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
-    with (
-        job(snakemake.log[0], f"draw residuals {snakemake.wildcards.scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"draw residuals {snakemake.wildcards.scene}"):
         draw_residuals(Alignment.load(snakemake.input.alignment), snakemake.output.figure)

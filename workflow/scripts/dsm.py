@@ -1,17 +1,13 @@
 """A scene's disparities to a surface model."""
 
 from stereobench.methods.scenes.surface_model import write_dsm
-from stereotruth.core.job import dask_scheduler, job
-from stereotruth.core.products.making import making
+from stereotruth.core.job import dask_scheduler
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
     address = snakemake.resources.dask
-    with (
-        job(snakemake.log[0], f"dsm {scene} {method}"),
-        making(snakemake.input, snakemake.output),
-        dask_scheduler(address) as scheduler,
-    ):
+    with rule_job(snakemake, f"dsm {scene} {method}"), dask_scheduler(address) as scheduler:
         write_dsm(
             snakemake.input.disparity,
             snakemake.output.dsm,

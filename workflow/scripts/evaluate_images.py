@@ -1,16 +1,12 @@
 """One city's labels against its images: SIFT matches (table 4) and image warping."""
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.labels_against_images import evaluate_city
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     stores = zip(given.left, given.right, given.disparity)
-    with (
-        job(snakemake.log[0], f"evaluate {city}") as log,
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"evaluate {city}") as log:
         table = evaluate_city(
             city,
             given.tiles,

@@ -2,17 +2,13 @@
 
 from pathlib import Path
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.labels_against_truth import MadeScene, evaluate_truth
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
     made = (snakemake.input[key] for key in ("disparity", "truth", "tiles"))
-    with (
-        job(snakemake.log[0], f"evaluate {scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"evaluate {scene}"):
         evaluate_truth(
             scene,
             [MadeScene(scene, *map(Path, made))],

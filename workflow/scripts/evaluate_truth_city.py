@@ -2,16 +2,12 @@
 
 from pathlib import Path
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.labels_against_truth import MadeScene, evaluate_truth
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
-    with (
-        job(snakemake.log[0], f"evaluate {city}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"evaluate {city}"):
         evaluate_truth(
             city,
             [

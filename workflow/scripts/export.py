@@ -4,9 +4,8 @@ import json
 from pathlib import Path
 
 from stereotruth.core.config.configuration import Export
-from stereotruth.core.job import job
 from stereotruth.core.products.files import atomic_file
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.tiles.export import City, Extras, export_city
 from stereotruth.tiles.scene_stores import SceneFiles
 from stereotruth.tiles.summary import summary_lines
@@ -14,10 +13,7 @@ from stereotruth.tiles.summary import summary_lines
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city
     of_right = list(given.disparity_of_right) or [None] * len(given.disparity)
-    with (
-        job(snakemake.log[0], f"export {city['city']}") as log,
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"export {city['city']}") as log:
         scenes = map(
             SceneFiles,
             snakemake.params.scenes,

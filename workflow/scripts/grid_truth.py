@@ -1,18 +1,14 @@
 """The exact truth of one synthetic scene on its left epipolar grid."""
 
 from stereocities.cities import city_of
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import describe
 from stereotruth.evaluate.epipolar_truth import write_grid_truth
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)
     scene = city.scene(snakemake.wildcards.scene)
-    with (
-        job(snakemake.log[0], f"truth of {scene.name}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"truth of {scene.name}"):
         write_grid_truth(
             city,
             scene,

@@ -1,17 +1,13 @@
 """Heights, positions and classes of what an original image shows."""
 
 from stereotruth.align.aligned_pair import Alignment
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe
 from stereotruth.labels.image_heights import open_inputs, write_image_heights
 
 if __name__ == "__main__":
     image, view = snakemake.wildcards.image, snakemake.params.view
-    with (
-        job(snakemake.log[0], f"heights {image}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"heights {image}"):
         alignment = Alignment.load(snakemake.input.alignment)
         fit = getattr(alignment, f"{view}_fit")
         inputs = open_inputs(

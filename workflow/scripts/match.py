@@ -3,17 +3,13 @@
 from pathlib import Path
 
 from stereobench.scores.predictions import predict
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     out = Path(snakemake.output[0])
-    with (
-        job(snakemake.log[0], f"match {of.dataset} {of.method}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"match {of.dataset} {of.method}"):
         predict(
             StereoDataset.of(of.dataset, params.dataset),
             params.split,

@@ -2,16 +2,12 @@
 
 from pathlib import Path
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.tiles.originals import write_originals
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.wildcards.city
-    with (
-        job(snakemake.log[0], f"originals {city}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"originals {city}"):
         names = snakemake.params.images
         images = dict(zip(names, zip(given.left, given.right)))
         stores = {Path(store).stem: store for store in given.heights}

@@ -2,17 +2,13 @@
 
 from stereobench.methods.scenes.predict_scene import predict_scene
 from stereotruth.core.config.methods import SceneMatching
-from stereotruth.core.job import dask_scheduler, job
-from stereotruth.core.products.making import making
+from stereotruth.core.job import dask_scheduler
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
     address = snakemake.resources.dask
-    with (
-        job(snakemake.log[0], f"predict {scene} {method}"),
-        making(snakemake.input, snakemake.output),
-        dask_scheduler(address) as scheduler,
-    ):
+    with rule_job(snakemake, f"predict {scene} {method}"), dask_scheduler(address) as scheduler:
         predict_scene(
             snakemake.input.left,
             snakemake.input.right,

@@ -1,18 +1,14 @@
 """One scene's points to its disparity grid."""
 
 from stereotruth.core.config.configuration import LabelSettings
-from stereotruth.core.job import dask_scheduler, job
-from stereotruth.core.products.making import making
+from stereotruth.core.job import dask_scheduler
+from stereotruth.core.products.making import rule_job
 from stereotruth.labels.project import project_scene
 from stereotruth.labels.scene_inputs import SceneInputs
 
 if __name__ == "__main__":
     scene, address = snakemake.wildcards.scene, snakemake.resources.dask
-    with (
-        job(snakemake.log[0], f"project {scene}"),
-        making(snakemake.input, snakemake.output),
-        dask_scheduler(address) as scheduler,
-    ):
+    with rule_job(snakemake, f"project {scene}"), dask_scheduler(address) as scheduler:
         inputs = SceneInputs.of(
             snakemake.input.left,
             snakemake.input.right,

@@ -1,18 +1,14 @@
 """One strip of a scene's points to the blocks of its disparity grid."""
 
 from stereotruth.core.config.configuration import LabelSettings
-from stereotruth.core.job import job
 from stereotruth.core.products.grids import Strip
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.labels.project import project_scene
 from stereotruth.labels.scene_inputs import SceneInputs
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
-    with (
-        job(snakemake.log[0], f"project {scene} {strip}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"project {scene} {strip}"):
         inputs = SceneInputs.of(
             snakemake.input.left,
             snakemake.input.right,

@@ -2,8 +2,7 @@
 
 from stereotruth.align.aligned_pair import Alignment
 from stereotruth.core.config.configuration import Rectify
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rectify import rectify
@@ -14,10 +13,7 @@ if __name__ == "__main__":
     given = snakemake.input
     files = [*given.left, *given.right, given.alignment]
     names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
-    with (
-        job(snakemake.log[0], f"rectify {scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"rectify {scene}"):
         alignment = Alignment.load(snakemake.input.alignment)
         bands = Rectify(**snakemake.params.bands)
         with open_pair(*names, *masks, bands=bands) as (left, right):

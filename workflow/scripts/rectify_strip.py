@@ -2,9 +2,8 @@
 
 from stereotruth.align.aligned_pair import Alignment
 from stereotruth.core.config.configuration import Rectify
-from stereotruth.core.job import job
 from stereotruth.core.products.grids import Strip
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.sensor.image_reader import open_pair
@@ -13,10 +12,7 @@ if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)
     given = snakemake.input
     names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
-    with (
-        job(snakemake.log[0], f"rectify {scene} {strip}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"rectify {scene} {strip}"):
         alignment = Alignment.load(snakemake.input.alignment)
         bands = Rectify(**snakemake.params.bands)
         with open_pair(*names, *masks, bands=bands) as (left, right):

@@ -5,17 +5,13 @@ from stereotruth.align.refine import refine
 from stereotruth.align.refine_report import write_refinement
 from stereotruth.align.tie_equations import write_equations
 from stereotruth.core.config.configuration import Rectify
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, digest
 from stereotruth.lidar.point_store import PointStore
 
 if __name__ == "__main__":
     scene = snakemake.wildcards.scene
-    with (
-        job(snakemake.log[0], f"refine {scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"refine {scene}"):
         given = snakemake.input
         masks = given.left_mask, given.right_mask
         inputs = checksums([*given.left, *given.right, given.alignment], *masks)

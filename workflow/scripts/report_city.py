@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.report.index_page import write_index
 from stereotruth.evaluate.report.page import CityFiles, write_report
 from stereotruth.pages.page import INDEX
@@ -15,10 +14,7 @@ if __name__ == "__main__":
         """Files results/<stage>/<city>/<scene>/<file> by scene."""
         return {Path(file).parent.name: file for file in files}
 
-    with (
-        job(snakemake.log[0], f"report {city}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"report {city}"):
         scenes = by_scene(given.alignments)
         files = CityFiles(
             tiles=given.tiles,

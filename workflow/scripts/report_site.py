@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from stereotruth.align.site_images import GivenImage, open_image
-from stereotruth.core.job import job
 from stereotruth.core.products.files import read_json
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.report.index_page import write_index
 from stereotruth.evaluate.report.site_page import write_site_page
 from stereotruth.lidar.point_store import PointStore
@@ -15,10 +14,7 @@ from stereotruth.sensor.pair_quality import rate
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
-    with (
-        job(snakemake.log[0], f"site {city}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"site {city}"):
         images = [
             open_image(GivenImage.of(name, Path(file), *cells))[0]
             for name, (file, *cells) in snakemake.params.images.items()

@@ -4,17 +4,13 @@ from pathlib import Path
 
 from stereobench.scores.score_method import ScoringPlan, score
 from stereobench.scores.strata import Products
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
     own = (Path("tiles"), Path("results/project"), Path("results/truth"))
-    with (
-        job(snakemake.log[0], f"score {of.dataset} {of.method}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"score {of.dataset} {of.method}"):
         score(
             StereoDataset.of(of.dataset, params.dataset),
             params.split,

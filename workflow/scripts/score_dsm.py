@@ -1,7 +1,6 @@
 """A scene's surface model against its LiDAR."""
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.report.index_page import write_index
 from stereotruth.evaluate.surface_models.page import write_verdict
 from stereotruth.evaluate.surface_models.reference import LidarReference
@@ -10,10 +9,7 @@ from stereotruth.pages.page import INDEX
 
 if __name__ == "__main__":
     scene, method = snakemake.wildcards.scene, snakemake.wildcards.method
-    with (
-        job(snakemake.log[0], f"score_dsm {scene} {method}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"score_dsm {scene} {method}"):
         verdict = score_surface_model(snakemake.input.dsm, LidarReference(snakemake.input.points))
         write_verdict(verdict, snakemake.output[0], f"{scene} by {method}", index=INDEX)
         write_index()

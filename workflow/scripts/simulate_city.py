@@ -2,13 +2,9 @@
 
 from stereocities.built_city import write_surfaces
 from stereocities.cities import city_of
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)
-    with (
-        job(snakemake.log[0], f"simulate {city.name}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"simulate {city.name}"):
         write_surfaces(city, snakemake.output.surfaces)

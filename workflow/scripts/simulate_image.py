@@ -2,17 +2,13 @@
 
 from stereocities.cities import city_of
 from stereocities.render import simulate_image
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)
     scene = city.scene(snakemake.wildcards.scene)
     view = snakemake.wildcards.view
-    with (
-        job(snakemake.log[0], f"simulate {scene.name} {view}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"simulate {scene.name} {view}"):
         simulate_image(
             city,
             scene,

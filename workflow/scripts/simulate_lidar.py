@@ -2,17 +2,13 @@
 
 from stereocities.cities import city_of
 from stereocities.lidar import simulate_lidar_tile
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)
     scene = city.scene(snakemake.wildcards.scene)
     tile = snakemake.wildcards.tile
-    with (
-        job(snakemake.log[0], f"simulate {tile}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"simulate {tile}"):
         simulate_lidar_tile(
             city,
             scene,

@@ -3,16 +3,12 @@
 from stereocities.cities import city_of
 from stereocities.control_points import simulate_points
 from stereocities.truth import simulate_truth
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
     city = city_of(snakemake.wildcards.city)
     scene = city.scene(snakemake.wildcards.scene)
-    with (
-        job(snakemake.log[0], f"simulate {scene.name} truth"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"simulate {scene.name} truth"):
         simulate_points(
             city,
             scene,

@@ -1,13 +1,9 @@
 """The results of a stereo method, packed to be scored elsewhere."""
 
 from stereobench.scores.submission import pack
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
     of = snakemake.wildcards
-    with (
-        job(snakemake.log[0], f"submission {of.dataset} {of.method}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"submission {of.dataset} {of.method}"):
         pack(snakemake.input.predictions, snakemake.input.scores, snakemake.output[0])

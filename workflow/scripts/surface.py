@@ -1,7 +1,6 @@
 """The points of a site to their surface, for all images that show it."""
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums
 from stereotruth.lidar.point_store import open_stores
 from stereotruth.sensor.shown_ground import GroundOfImages
@@ -10,10 +9,7 @@ from stereotruth.surface.scale import ground_cell
 
 if __name__ == "__main__":
     scene, images = snakemake.wildcards.scene, sorted(set(snakemake.input.images))
-    with (
-        job(snakemake.log[0], f"surface {scene}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"surface {scene}"):
         ground = GroundOfImages.open(images)
         make_surface(
             open_stores(sorted(snakemake.input.points)),

@@ -3,16 +3,12 @@
 from pathlib import Path
 
 from stereobench.methods.kinds import need_pytorch
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 if __name__ == "__main__":
     of, params = snakemake.wildcards, snakemake.params
-    with (
-        job(snakemake.log[0], f"train {of.dataset} {of.method}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"train {of.dataset} {of.method}"):
         need_pytorch(of.method, params.kind)
         from stereobench.networks.training import train
         from stereobench.networks.training_settings import TrainingSettings

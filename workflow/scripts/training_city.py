@@ -1,15 +1,11 @@
 """Tiles of one training city, with exact labels."""
 
-from stereotruth.core.job import job
-from stereotruth.core.products.making import making
+from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.exact_tiles import make_city
 
 if __name__ == "__main__":
     number = snakemake.wildcards.number
-    with (
-        job(snakemake.log[0], f"training_city {number}"),
-        making(snakemake.input, snakemake.output),
-    ):
+    with rule_job(snakemake, f"training_city {number}"):
         make_city(
             int(number),
             snakemake.output[0],

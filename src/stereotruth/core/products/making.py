@@ -13,8 +13,10 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from ..errors import InputError
+from ..job import job
 from . import remote_files
 from .files import files_below
 from .provenance import digest, file_sha256
@@ -242,6 +244,13 @@ def making(inputs: Iterable[str | Path], outputs: Sequence[str | Path]) -> Itera
             raise
         finally:
             _inputs = {}
+
+
+@contextmanager
+def rule_job(snakemake: Any, name: str) -> Iterator[logging.Logger]:
+    """All that a job of a rule does, in its script: see :func:`..job.job`, and :func:`making`."""
+    with job(snakemake.log[0], name) as lines, making(snakemake.input, snakemake.output):
+        yield lines
 
 
 def begin_notes() -> None:
