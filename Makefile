@@ -75,7 +75,7 @@ networks: $(READY)
 	$(PIP) install --no-build-isolation -e '.[networks]'
 
 test-networks: networks
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/methods/networks tests/workflow/test_train.py
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/networks tests/workflow/test_train.py
 
 test-s3: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest tests/workflow/test_object_storage.py
