@@ -15,7 +15,6 @@ rule adjust:
         "logs/adjust/{city}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=30,
@@ -46,7 +45,6 @@ rule adjusted_alignment:
         "logs/adjusted_alignment/{city}/{scene}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=1000,
         runtime=10,

@@ -17,7 +17,6 @@ rule align:
         "logs/align/{city}/{scene}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=1000,
         runtime=10,
@@ -52,7 +51,6 @@ rule draw_residuals:
         "logs/draw_residuals/{city}/{scene}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=1000,
         runtime=10,

@@ -46,7 +46,6 @@ rule score:
         method="[^/.]+",  # not a table of all methods
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=120,
@@ -84,7 +83,6 @@ rule submission:
         method="[^/.]+",
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=1000,
         runtime=30,
@@ -137,7 +135,6 @@ rule benchmark_tables:
         dataset="[^/]+",
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=30,

@@ -14,7 +14,6 @@ rule closure_of_site:
         "logs/closure_of_site/{city}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=3000,
         runtime=120,

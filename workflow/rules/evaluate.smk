@@ -27,7 +27,7 @@ rule grid_truth:
 
 rule evaluate_truth:
     input:
-        disparity=rules.project.output.disparity,
+        disparity="results/project/{city}/{scene}.zarr",
         tiles="tiles/{city}",
         truth=rules.grid_truth.output.truth,
     output:
@@ -51,6 +51,7 @@ rule evaluate_truth:
     params:
         sources=upstream("evaluate_truth"),
         script=content_of("../scripts/evaluate_truth.py"),
+        scenes=lambda w: [w.scene],
         code=source_digest("stereotruth.evaluate.labels_against_truth"),
     message:
         "Comparing scene {wildcards.scene} with its exact truth"
@@ -58,10 +59,10 @@ rule evaluate_truth:
         "../scripts/evaluate_truth.py"
 
 
-rule evaluate_truth_city:
+use rule evaluate_truth as evaluate_truth_city with:
     input:
         disparity=lambda w: expand(
-            rules.project.output.disparity, city=w.city, scene=synthetic_scenes(w.city)
+            "results/project/{city}/{scene}.zarr", city=w.city, scene=synthetic_scenes(w.city)
         ),
         tiles="tiles/{city}",
         truth=lambda w: expand(
@@ -79,21 +80,13 @@ rule evaluate_truth_city:
         "logs/evaluate_truth_city/{city}.log",
     benchmark:
         "logs/evaluate_truth_city/{city}.tsv"
-    conda:
-        CONDA
-    threads: 2
-    resources:
-        mem_mb=3000,
-        runtime=60,
     params:
         sources=upstream("evaluate_truth_city"),
-        script=content_of("../scripts/evaluate_truth_city.py"),
+        script=content_of("../scripts/evaluate_truth.py"),
         scenes=lambda w: synthetic_scenes(w.city),
         code=source_digest("stereotruth.evaluate.labels_against_truth"),
     message:
         "Comparing city {wildcards.city} with its exact truth"
-    script:
-        "../scripts/evaluate_truth_city.py"
 
 
 rule evaluate:

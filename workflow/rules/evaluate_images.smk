@@ -39,7 +39,6 @@ rule evaluate_images:
         "logs/evaluate_images/{city}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=30,

@@ -102,7 +102,6 @@ rule dataset:
         "logs/dataset/dataset.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=1000,
         runtime=60,
@@ -126,7 +125,6 @@ rule verify:
         "logs/verify/verify.log",
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=1000,
         runtime=60,

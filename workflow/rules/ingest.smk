@@ -10,7 +10,6 @@ rule ingest:
         "logs/ingest/{city}/{scene}/{lidar}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=60,

@@ -75,7 +75,6 @@ rule score_dsm:
         method="[^/]+",
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=3000,
         runtime=240,

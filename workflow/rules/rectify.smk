@@ -35,7 +35,7 @@ rule rectify:
         "../scripts/rectify.py"
 
 
-rule rectify_strip:
+use rule rectify as rectify_strip with:
     input:
         left=left_image,
         right=right_image,
@@ -48,15 +48,12 @@ rule rectify_strip:
         "logs/rectify_strip/{city}/{scene}_{strip}.log",
     benchmark:
         "logs/rectify_strip/{city}/{scene}_{strip}.tsv"
-    conda:
-        CONDA
-    threads: 2
     resources:
         mem_mb=2000,
         runtime=60,
     params:
         sources=upstream("rectify_strip"),
-        script=content_of("../scripts/rectify_strip.py"),
+        script=content_of("../scripts/rectify.py"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
         bands=SETTINGS.rectify.model_dump(),
         code=source_digest(
@@ -66,5 +63,3 @@ rule rectify_strip:
         ),
     message:
         "Making strip {wildcards.strip} of the epipolar images of scene {wildcards.scene}"
-    script:
-        "../scripts/rectify_strip.py"

@@ -21,7 +21,6 @@ rule refine:
         "logs/refine/{city}/{scene}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=30,
@@ -60,7 +59,6 @@ rule draw_refinement:
         "logs/draw_refinement/{city}/{scene}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=1000,
         runtime=10,

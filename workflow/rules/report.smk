@@ -63,7 +63,6 @@ rule report_site:
         "logs/report_site/{city}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=30,

@@ -10,7 +10,6 @@ rule simulate_city:
         "logs/simulate_city/{city}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=8000,  # of a twin 2 km wide; a drawn city takes a quarter
         runtime=30,
@@ -37,7 +36,6 @@ rule simulate_image:
         "logs/simulate_image/{city}/{scene}/{view}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=3000,
         runtime=30,
@@ -66,7 +64,6 @@ rule simulate_lidar:
         tile=r"[^/]+\.la[sz]",
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=3000,
         runtime=30,
@@ -97,7 +94,6 @@ rule simulate_truth:
         "logs/simulate_truth/{city}/{scene}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=3000,
         runtime=30,

@@ -12,7 +12,6 @@ rule compare_strips:
         "logs/compare_strips/{city}/{scene}.tsv"
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=60,
@@ -41,7 +40,6 @@ rule move_strips:
         origin="|".join(SCENES),
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=2000,
         runtime=60,

@@ -14,7 +14,6 @@ rule training_city:
         number="[0-9]+",
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=3000,
         runtime=60,
@@ -46,7 +45,6 @@ rule training_cities:
         tiles="[1-9][0-9]*",
     conda:
         CONDA
-    threads: 1
     resources:
         mem_mb=500,
         runtime=30,

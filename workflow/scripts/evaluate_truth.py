@@ -1,4 +1,4 @@
-"""One synthetic scene's disparities against the exact truth."""
+"""Disparities of a synthetic scene, or of all scenes of a city, against the exact truth."""
 
 from pathlib import Path
 
@@ -6,12 +6,18 @@ from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.labels_against_truth import MadeScene, evaluate_truth
 
 if __name__ == "__main__":
-    scene = snakemake.wildcards.scene
-    made = (snakemake.input[key] for key in ("disparity", "truth", "tiles"))
-    with rule_job(snakemake, f"evaluate {scene}"):
+    given, scenes = snakemake.input, snakemake.params.scenes
+    of = snakemake.wildcards.get("scene", snakemake.wildcards.city)
+    disparity, truth = (
+        [of] if isinstance(of, str) else of for of in (given.disparity, given.truth)
+    )
+    with rule_job(snakemake, f"evaluate {of}"):
         evaluate_truth(
-            scene,
-            [MadeScene(scene, *map(Path, made))],
+            of,
+            [
+                MadeScene(scene, *map(Path, (labels, exact, given.tiles)))
+                for scene, labels, exact in zip(scenes, disparity, truth)
+            ],
             snakemake.output.figures,
             snakemake.output.table,
             workers=snakemake.threads,

@@ -1,7 +1,8 @@
-"""One aligned pair to epipolar images."""
+"""One aligned pair to epipolar images, or to one strip of their blocks."""
 
 from stereotruth.align.aligned_pair import Alignment
 from stereotruth.core.config.configuration import Rectify
+from stereotruth.core.products.grids import Strip
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe
 from stereotruth.epipolar.fit import fit_epipolar
@@ -9,14 +10,12 @@ from stereotruth.epipolar.rectify import rectify
 from stereotruth.sensor.image_reader import open_pair
 
 if __name__ == "__main__":
-    scene = snakemake.wildcards.scene
-    given = snakemake.input
-    files = [*given.left, *given.right, given.alignment]
+    scene, given, made = snakemake.wildcards.scene, snakemake.input, snakemake.output
+    strip, bands = Strip.of_wildcards(snakemake.wildcards), snakemake.params.bands
     names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
-    with rule_job(snakemake, f"rectify {scene}"):
-        alignment = Alignment.load(snakemake.input.alignment)
-        bands = Rectify(**snakemake.params.bands)
-        with open_pair(*names, *masks, bands=bands) as (left, right):
+    with rule_job(snakemake, f"rectify {scene} {strip or ''}".strip()):
+        alignment = Alignment.load(given.alignment)
+        with open_pair(*names, *masks, bands=Rectify(**bands)) as (left, right):
             model = fit_epipolar(
                 alignment.left,
                 alignment.right,
@@ -26,15 +25,19 @@ if __name__ == "__main__":
                 height_range=alignment.model_heights,
                 names=names,
             )
-            rectify(
-                left,
-                right,
-                model,
-                snakemake.output.epipolar,
-                snakemake.output.left,
-                snakemake.output.right,
-                workers=snakemake.threads,
-                provenance=describe(
-                    checksums(files, *masks), snakemake.params.bands, snakemake.params.code
-                ),
-            )
+            if strip:
+                stores = snakemake.params.stores
+                rectify(left, right, model, None, *stores, workers=snakemake.threads, strip=strip)
+                strip.tell(made.done)
+            else:
+                inputs = checksums([*given.left, *given.right, given.alignment], *masks)
+                rectify(
+                    left,
+                    right,
+                    model,
+                    made.epipolar,
+                    made.left,
+                    made.right,
+                    workers=snakemake.threads,
+                    provenance=describe(inputs, bands, snakemake.params.code),
+                )

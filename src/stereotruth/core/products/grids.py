@@ -185,6 +185,12 @@ class Strip:
         number, _, count = text.partition("-of-")
         return cls(int(number), int(count))
 
+    @classmethod
+    def of_wildcards(cls, wildcards: Any) -> Strip | None:
+        """That of a job of the workflow; None for one that makes a whole grid."""
+        text = wildcards.get("strip")
+        return cls.parse(text) if text else None
+
     def __str__(self) -> str:
         return f"{self.number}-of-{self.count}"
 
