@@ -17,7 +17,6 @@ rule audit:
         runtime=240,
     params:
         sources=upstream("audit"),
-        script=content_of("../scripts/audit.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         settings=SETTINGS.audit.model_dump(),
         measuring=source_digest("stereobench.audit.pair", "stereobench.audit.sharing"),

@@ -19,7 +19,6 @@ rule match:
         runtime=480,
     params:
         sources=upstream("match"),
-        script=content_of("../scripts/match.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         method=lambda w: method_entry(w.method, w.dataset),
         split=SETTINGS.benchmark.split,
@@ -51,7 +50,6 @@ rule score:
         runtime=120,
     params:
         sources=upstream("score"),
-        script=content_of("../scripts/score.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
         protocol=lambda w: dataset_settings(w.dataset).protocol,
@@ -88,7 +86,6 @@ rule submission:
         runtime=30,
     params:
         sources=upstream("submission"),
-        script=content_of("../scripts/submission.py"),
         code=source_digest("stereobench.scores.submission"),
     message:
         "Packing the results of {wildcards.method} on dataset {wildcards.dataset}"
@@ -140,7 +137,6 @@ rule benchmark_tables:
         runtime=30,
     params:
         sources=upstream("benchmark_tables"),
-        script=content_of("../scripts/benchmark_tables.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
         seed=SETTINGS.seed,

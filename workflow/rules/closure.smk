@@ -19,7 +19,6 @@ rule closure_of_site:
         runtime=120,
     params:
         sources=upstream("closure_of_site"),
-        script=content_of("../scripts/closure_of_site.py"),
         pairs=lambda w: {s: ADJUSTED[s] for s in adjusted_pairs(w.city)},
         code=source_digest("stereotruth.evaluate.closure"),
     message:

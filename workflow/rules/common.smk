@@ -5,14 +5,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from stereotruth.core.config.configuration import Configuration
-from stereotruth.project.project import epoch_of_city
 from stereotruth.core.errors import InputError, in_words
-from stereotruth.core.products.provenance import SOURCES, file_sha256, script_digest, source_digest
+from stereotruth.core.products.provenance import SOURCES, file_sha256, source_digest
 from stereotruth.project.project import (
     FILES,
     adjusted_scenes,
     check_fixed,
     days_of_pair,
+    epoch_of_city,
     file_of_image,
     is_synthetic,
     lidar_days,
@@ -85,8 +85,3 @@ def templates_of(template):
     """Digests of a page's template and of what all pages share."""
     shared = sorted((SOURCES / "stereotruth/pages").glob("*.jinja"))
     return [file_sha256(file) for file in (SOURCES / template, *shared)]
-
-
-def content_of(script):
-    """Digest of a rule's script: the time of its file counts for nothing (profiles/default)."""
-    return script_digest(workflow.source_path(script))

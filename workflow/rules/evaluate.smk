@@ -17,7 +17,6 @@ rule grid_truth:
         runtime=60,
     params:
         sources=upstream("grid_truth"),
-        script=content_of("../scripts/grid_truth.py"),
         code=source_digest("stereotruth.evaluate.epipolar_truth", "stereocities.cities"),
     message:
         "Casting rays through the epipolar pixels of synthetic scene {wildcards.scene}"
@@ -50,7 +49,6 @@ rule evaluate_truth:
         runtime=60,
     params:
         sources=upstream("evaluate_truth"),
-        script=content_of("../scripts/evaluate_truth.py"),
         scenes=lambda w: [w.scene],
         code=source_digest("stereotruth.evaluate.labels_against_truth"),
     message:
@@ -81,8 +79,7 @@ use rule evaluate_truth as evaluate_truth_city with:
     benchmark:
         "logs/evaluate_truth_city/{city}.tsv"
     params:
-        sources=upstream("evaluate_truth_city"),
-        script=content_of("../scripts/evaluate_truth.py"),
+        sources=upstream("evaluate_truth_city", "evaluate_truth"),
         scenes=lambda w: synthetic_scenes(w.city),
         code=source_digest("stereotruth.evaluate.labels_against_truth"),
     message:

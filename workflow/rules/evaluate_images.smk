@@ -2,11 +2,9 @@ rule evaluate_images:
     input:
         tiles="tiles/{city}",
         matches="results/export/{city}/matches.csv",
-        left=lambda w: [f"results/rectify/{w.city}/{s.scene}/left.zarr" for s in scenes_of(w.city)],
-        right=lambda w: [
-            f"results/rectify/{w.city}/{s.scene}/right.zarr" for s in scenes_of(w.city)
-        ],
-        disparity=lambda w: [f"results/project/{w.city}/{s.scene}.zarr" for s in scenes_of(w.city)],
+        left=of_scenes("results/rectify/{city}/{scene}/left.zarr"),
+        right=of_scenes("results/rectify/{city}/{scene}/right.zarr"),
+        disparity=of_scenes("results/project/{city}/{scene}.zarr"),
     output:
         table4=report(
             "results/evaluate/{city}/table4.csv",
@@ -44,7 +42,6 @@ rule evaluate_images:
         runtime=30,
     params:
         sources=upstream("evaluate_images"),
-        script=content_of("../scripts/evaluate_images.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         code=source_digest("stereotruth.evaluate.labels_against_images"),
     message:

@@ -1,16 +1,14 @@
 rule export:
     input:
         alignment=lambda w: [alignment_of(s) for s in scenes_of(w.city)],
-        left=lambda w: [f"results/rectify/{w.city}/{s.scene}/left.zarr" for s in scenes_of(w.city)],
-        right=lambda w: [
-            f"results/rectify/{w.city}/{s.scene}/right.zarr" for s in scenes_of(w.city)
-        ],
-        disparity=lambda w: [f"results/project/{w.city}/{s.scene}.zarr" for s in scenes_of(w.city)],
-        disparity_of_right=lambda w: [
-            f"results/project/{w.city}/{s.scene}_right.zarr"
-            for s in scenes_of(w.city)
+        left=of_scenes("results/rectify/{city}/{scene}/left.zarr"),
+        right=of_scenes("results/rectify/{city}/{scene}/right.zarr"),
+        disparity=of_scenes("results/project/{city}/{scene}.zarr"),
+        disparity_of_right=(
+            of_scenes("results/project/{city}/{scene}_right.zarr")
             if SETTINGS.project.right_view
-        ],
+            else []
+        ),
     output:
         tiles=directory("tiles/{city}"),
         summary="results/export/{city}/summary.json",
@@ -42,7 +40,6 @@ rule export:
         runtime=60,
     params:
         sources=upstream("export"),
-        script=content_of("../scripts/export.py"),
         scenes=lambda w: [s.scene for s in scenes_of(w.city)],
         acquired=lambda w: [days_of_pair(IMAGE_NAMES[s.scene], IMAGES) for s in scenes_of(w.city)],
         city=lambda w: {k: v for k, v in asdict(CITIES[w.city]).items() if k != "epoch"},
@@ -80,7 +77,6 @@ rule originals:
         runtime=60,
     params:
         sources=upstream("originals"),
-        script=content_of("../scripts/originals.py"),
         images=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
         code=source_digest("stereotruth.tiles.originals"),
     message:
@@ -107,7 +103,6 @@ rule dataset:
         runtime=60,
     params:
         sources=upstream("dataset"),
-        script=content_of("../scripts/dataset.py"),
         catalogs={
             "catalogs": list(SETTINGS.dataset.catalogs),
             "acquired": SETTINGS.dataset.acquired,

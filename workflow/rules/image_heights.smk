@@ -22,7 +22,6 @@ rule image_heights:
         runtime=240,
     params:
         sources=upstream("image_heights"),
-        script=content_of("../scripts/image_heights.py"),
         view=lambda w: scene_of_image(w.image)[1],
         code=source_digest("stereotruth.labels.image_heights"),
     message:

@@ -36,12 +36,7 @@ def right_image(wildcards):
 
 def given_in(column):
     """Input function: the file that a scene's row names in a column, if it names one."""
-
-    def file_of(wildcards):
-        path = getattr(SCENES[wildcards.scene], column)
-        return given(path) if path else []
-
-    return file_of
+    return lambda w: given(path) if (path := getattr(SCENES[w.scene], column)) else []
 
 
 def alignment_of(wildcards):
@@ -69,12 +64,19 @@ def refinement_figures(wildcards):
     ]
 
 
-def residual_figures(wildcards):
-    """The figures of the residuals of a city's scenes by their control points."""
-    return [
-        f"results/align/{scene.city}/{scene.scene}/residuals.png"
-        for scene in scenes_of(wildcards.city)
-    ]
+def of_scenes(file):
+    """Input function: a file of each scene of a city."""
+    return lambda w: [file.format(city=w.city, scene=s.scene) for s in scenes_of(w.city)]
+
+
+def of_synthetic(file):
+    """Input function: a file of a city, if it has synthetic scenes."""
+    return lambda w: [file.format(city=w.city)] if synthetic_scenes(w.city) else []
+
+
+def of_adjusted(file):
+    """Input function: a file of a city, if images of it are adjusted together."""
+    return lambda w: [file.format(city=w.city)] if adjusted_pairs(w.city) else []
 
 
 def adjusted_pairs(city):
@@ -84,14 +86,7 @@ def adjusted_pairs(city):
 
 def of_adjusted_pairs(file):
     """Input function: a file of each scene of a city whose images are adjusted together."""
-
-    def files_of(wildcards):
-        return [
-            file.format(city=wildcards.city, scene=scene)
-            for scene in adjusted_pairs(wildcards.city)
-        ]
-
-    return files_of
+    return lambda w: [file.format(city=w.city, scene=scene) for scene in adjusted_pairs(w.city)]
 
 
 def gcps_of_adjusted(wildcards):
@@ -112,15 +107,6 @@ def strips_made(wildcards, file):
     count = strips if isinstance(strips, int) else strips.get(wildcards.scene, 1)
     names = [f"{k}-of-{count}" for k in range(count)] if count > 1 else []
     return expand(file, **wildcards, strip=names)
-
-
-def truth_of_city(city, kind):
-    """The city's figures against the exact truth (json, csv), if it has synthetic scenes."""
-    return [f"results/evaluate/{city}/truth.{kind}"] if synthetic_scenes(city) else []
-
-
-def lidar_file(wildcards):
-    return given(LIDAR[wildcards.scene][wildcards.lidar])
 
 
 @cache
@@ -234,11 +220,6 @@ def files_of_sheet(wildcards):
 def is_site(city):
     """Whether scenes of the city are pairs of its images sheet, so that it has a page of a site."""
     return any(all(IMAGE_NAMES[s.scene]) for s in SCENES.values() if s.city == city)
-
-
-def adjustment_of_site(wildcards):
-    """The city's images adjusted together, if they are."""
-    return [f"results/adjust/{wildcards.city}.json"] if adjusted_pairs(wildcards.city) else []
 
 
 def closure_of(wildcards):

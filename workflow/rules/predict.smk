@@ -20,7 +20,6 @@ rule predict_scene:
         dask=SETTINGS.dask.scheduler_address or "",
     params:
         sources=upstream("predict_scene"),
-        script=content_of("../scripts/predict_scene.py"),
         method=lambda w: method_entry(w.method, prediction_dataset()),
         settings=lambda w: scene_prediction(),
         code=lambda w: source_digest(
@@ -52,7 +51,6 @@ rule dsm:
         dask=SETTINGS.dask.scheduler_address or "",
     params:
         sources=upstream("dsm"),
-        script=content_of("../scripts/dsm.py"),
         settings=SETTINGS.predict.dsm.model_dump(),
         code=source_digest("stereobench.methods.scenes.surface_model"),
     message:
@@ -80,7 +78,6 @@ rule score_dsm:
         runtime=240,
     params:
         sources=upstream("score_dsm"),
-        script=content_of("../scripts/score_dsm.py"),
         code=source_digest("stereotruth.evaluate.surface_models.page"),
         templates=templates_of("stereotruth/evaluate/surface_models/page.html.jinja"),
     message:

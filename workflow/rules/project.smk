@@ -25,7 +25,6 @@ rule project:
         dask=SETTINGS.dask.scheduler_address or "",
     params:
         sources=upstream("project"),
-        script=content_of("../scripts/project.py"),
         view=lambda w: "right" if w.side else "left",
         settings=PROJECTION,
         light=lambda w: light_of(w.scene),
@@ -55,8 +54,7 @@ use rule project as project_strip with:
         runtime=120,
         dask="",
     params:
-        sources=upstream("project_strip"),
-        script=content_of("../scripts/project.py"),
+        sources=upstream("project_strip", "project"),
         view=lambda w: "right" if w.side else "left",
         store="results/project/{city}/{scene}{side}.zarr",
         settings=PROJECTION,

@@ -22,7 +22,6 @@ rule rectify:
         runtime=120,
     params:
         sources=upstream("rectify"),
-        script=content_of("../scripts/rectify.py"),
         bands=SETTINGS.rectify.model_dump(),
         code=source_digest(
             "stereotruth.epipolar.rectify",
@@ -52,8 +51,7 @@ use rule rectify as rectify_strip with:
         mem_mb=2000,
         runtime=60,
     params:
-        sources=upstream("rectify_strip"),
-        script=content_of("../scripts/rectify.py"),
+        sources=upstream("rectify_strip", "rectify"),
         stores=lambda w: [f"results/rectify/{w.city}/{w.scene}/{v}.zarr" for v in VIEWS],
         bands=SETTINGS.rectify.model_dump(),
         code=source_digest(

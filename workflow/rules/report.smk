@@ -3,17 +3,15 @@ rule report_city:
         tiles="tiles/{city}",
         coverage="results/export/{city}/coverage.png",
         looks="results/export/{city}/quick_looks",
-        alignments=lambda w: [
-            f"results/align/{w.city}/{s.scene}/alignment.json" for s in scenes_of(w.city)
-        ],
+        alignments=of_scenes("results/align/{city}/{scene}/alignment.json"),
         refinements=refinements,
-        residual_figures=residual_figures,
+        residual_figures=of_scenes("results/align/{city}/{scene}/residuals.png"),
         refinement_figures=refinement_figures,
         table4=rules.evaluate_images.output.table4,
         sift=rules.evaluate_images.output.sift,
         sift_figure=rules.evaluate_images.output.sift_figure,
-        truth=lambda w: truth_of_city(w.city, "json"),
-        truth_table=lambda w: truth_of_city(w.city, "csv"),
+        truth=of_synthetic("results/evaluate/{city}/truth.json"),
+        truth_table=of_synthetic("results/evaluate/{city}/truth.csv"),
     output:
         report(
             "results/report/{city}/index.html",
@@ -33,7 +31,6 @@ rule report_city:
         runtime=60,
     params:
         sources=upstream("report_city"),
-        script=content_of("../scripts/report_city.py"),
         sliders=SETTINGS.report.sliders,
         code=source_digest("stereotruth.evaluate.report.page"),
         templates=templates_of("stereotruth/evaluate/report/page.html.jinja"),
@@ -47,7 +44,7 @@ rule report_site:
     input:
         images=files_of_sheet,
         points=point_stores_of_city,
-        adjusted=adjustment_of_site,
+        adjusted=of_adjusted("results/adjust/{city}.json"),
         closure=closure_of,
         page="results/report/{city}/index.html",
     output:
@@ -68,7 +65,6 @@ rule report_site:
         runtime=30,
     params:
         sources=upstream("report_site"),
-        script=content_of("../scripts/report_site.py"),
         images=lambda w: {
             name: [file_of_image(row), row.acquired, row.sun_azimuth, row.sun_elevation]
             for name, row in sheet_images(w.city).items()

@@ -3,8 +3,7 @@
 import shutil
 import sys
 
-from stereotruth.core.products.making import FileLock
-from stereotruth.core.products.making import begin_notes, noted
+from stereotruth.core.products.making import FileLock, begin_notes, noted
 
 LOCKS = []  # held until this process ends
 

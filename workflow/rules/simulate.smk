@@ -15,7 +15,6 @@ rule simulate_city:
         runtime=30,
     params:
         sources=upstream("simulate_city"),
-        script=content_of("../scripts/simulate_city.py"),
         code=source_digest("stereocities.built_city", "stereocities.cities"),
     message:
         "Building synthetic city {wildcards.city}"
@@ -41,7 +40,6 @@ rule simulate_image:
         runtime=30,
     params:
         sources=upstream("simulate_image"),
-        script=content_of("../scripts/simulate_image.py"),
         seed=SETTINGS.seed,
         code=source_digest("stereocities.render", "stereocities.cities"),
     message:
@@ -69,7 +67,6 @@ rule simulate_lidar:
         runtime=30,
     params:
         sources=upstream("simulate_lidar"),
-        script=content_of("../scripts/simulate_lidar.py"),
         spacing_m=SETTINGS.simulate.lidar_spacing_m,
         seed=SETTINGS.seed,
         code=source_digest("stereocities.lidar", "stereocities.cities"),
@@ -99,7 +96,6 @@ rule simulate_truth:
         runtime=30,
     params:
         sources=upstream("simulate_truth"),
-        script=content_of("../scripts/simulate_truth.py"),
         seed=SETTINGS.seed,
         code=source_digest(
             "stereocities.truth", "stereocities.control_points", "stereocities.cities"

@@ -1,15 +1,15 @@
 """What products follow from: Snakemake makes again what has other params (profiles/default).
 
-Beside its settings each rule has ``script`` and ``code``, digests of what runs, and ``sources``,
-digests of all that its inputs follow from: of users' files their content, of products the params
-and sources of the rule that makes them. So what is behind an edit is due until it is made, whatever
-jobs failed or were killed in between. Times of users' files count for nothing.
+Beside its settings each rule has ``code``, a digest of the modules that run, and ``sources``: digests
+of its script, and of all that its inputs follow from: of users' files their content, of products
+the params and sources of the rule that makes them. So what is behind an edit is due until it is
+made, whatever jobs failed or were killed in between. Times of users' files count for nothing.
 """
 
 from functools import cache
 
 from stereotruth.core.products.making import Checksums
-from stereotruth.core.products.provenance import digest
+from stereotruth.core.products.provenance import digest, script_digest
 
 CHECKSUMS = Checksums(Path(".snakemake", "stereotruth", "checksums"))
 BUCKET = workflow.storage_settings.default_storage_prefix or ""
@@ -72,13 +72,17 @@ def origin(path):
     return digest({str(name): checksum_of(path)})
 
 
-def upstream(name):
-    """Params function: digests of what the inputs of a rule follow from, by names of inputs."""
+def upstream(name, script=None):
+    """Params function: digests of a rule's script, and of what its inputs follow from, by names.
+
+    ``script``: its name, if it is not the rule's. The time of its file counts for nothing.
+    """
+    content = script_digest(workflow.source_path(f"../scripts/{script or name}.py"))
 
     def sources(wildcards):
-        found = {}
         if not workflow.is_main_process:  # Snakemake keeps the params of the process that plans
-            return found
+            return {}
+        found = {"script": content}
         for key, items in workflow.get_rule(name).input.items():
             items = [items] if isinstance(items, str) or callable(items) else items
             files = []

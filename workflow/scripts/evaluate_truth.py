@@ -9,7 +9,7 @@ if __name__ == "__main__":
     given, scenes = snakemake.input, snakemake.params.scenes
     of = snakemake.wildcards.get("scene", snakemake.wildcards.city)
     disparity, truth = (
-        [of] if isinstance(of, str) else of for of in (given.disparity, given.truth)
+        [one] if isinstance(one, str) else one for one in (given.disparity, given.truth)
     )
     with rule_job(snakemake, f"evaluate {of}"):
         evaluate_truth(

@@ -11,7 +11,7 @@ import pytest
 from rasterio.transform import Affine
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products import raster_values
+from stereotruth.core.products import rasters
 from stereotruth.lidar import raster_points
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
@@ -63,7 +63,7 @@ def test_the_store_does_not_depend_on_what_is_read_at_once(tmp_path, monkeypatch
     file = write_raster(tmp_path / "a.tif", surface())
     digests = set()
     for cells in (1, 1000, 1 << 20):
-        monkeypatch.setattr(raster_values, "MOST_CELLS", cells)
+        monkeypatch.setattr(rasters, "MOST_CELLS", cells)
         ingest(file, tmp_path / "a.points")
         digests.add(tree_digest(tmp_path / "a.points"))
     assert len(digests) == 1
