@@ -2,19 +2,12 @@
 
     python -m tests.synthetic.damage_rounds --mutants 10000 --seed 1 [--lidar FOLDER …]
 
-prints the table of docs/damaged_input.md; ``--log`` keeps a line for every mutant. Every mutant is
-made by the number of its round alone, so that ``--only LAZ:1234`` does one again.
-
-    python -m tests.synthetic.damage_rounds --products scratch/folder --mutants 120
-
-does so with sheets, control points and what a run has made, so many mutants of each kind; the small
-city is made in the folder, if it is not there.
+prints the table of docs/damaged_input.md. Every mutant is made by the number of its round alone.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
 import json
 import os
@@ -28,7 +21,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +39,6 @@ from stereotruth.sensor.image_reader import Source
 
 from . import damage
 from .damaged_cases import Case, synthetic_cases
-from .damaged_products import READERS as PRODUCTS
-from .damaged_products import cannot_be_told, product_cases, read_product
-from .project import make_tiny
 
 MEMORY = 2 << 30  # bytes beyond what the process has before it meets a damaged file
 SECONDS = 30.0
@@ -127,20 +117,6 @@ def _read_rpc(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
     return _aligned((image, case.file.parent / "right.tif"), gcps, folder)
 
 
-def _misbehave(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
-    """Does to the process what damaged files must not, to see that it is noticed."""
-    kind = case.reader.removeprefix("misbehave: ")
-    if file == case.file or kind == "other values":
-        return str(file), []
-    if kind == "abort":
-        os.abort()
-    if kind == "hang":
-        time.sleep(1000)
-    if kind == "memory":
-        np.ones(MEMORY)
-    raise BaseException(kind)
-
-
 def _here(work: Callable[[], Any], file: Path) -> Any:
     return work()
 
@@ -163,9 +139,7 @@ class Reader:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def _read(self, case: Case, file: Path) -> tuple[Any, list[str]]:
-        if case.reader in PRODUCTS:
-            return read_product(case, file, self.folder)
-        return READERS.get(case.reader, _misbehave)(case, file, self.folder)
+        return READERS[case.reader](case, file, self.folder)
 
     def outcome(self, name: str, number: int) -> Outcome:
         case = self.cases[name]
@@ -182,9 +156,8 @@ class Reader:
             value, remarks = self._read(case, file)
         except InputError as error:
             says = str(error)
-            place = Path(case.options.get("place", file.name))
-            named = file.name in says or (place.parent.suffix and place.parent.name in says)
-            came = "refused" if named and "Remedy" in says else "other file named"
+            named = file.name in says and "Remedy" in says
+            came = "refused" if named else "other file named"
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 raise
@@ -194,10 +167,7 @@ class Reader:
             new = [text for text in remarks if text not in usual]
             came, says = "right" if value == good else "remarked", "; ".join(new)
             if came == "remarked" and not new:
-                if case.reader in PRODUCTS:
-                    hidden = cannot_be_told(case, data)
-                else:
-                    hidden = case.reader in READERS and case.cannot_be_told(data, value, good)
+                hidden = case.cannot_be_told(data, value, good)
                 came = "cannot be told" if hidden else "other values"
         children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss  # the most so far
         most = max(_kib("VmHWM:"), children) - before
@@ -318,35 +288,10 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--lidar", type=Path, nargs="*", default=[], help="more good files")
     parser.add_argument("--images", type=Path, nargs="*", default=[], help="with RPCs")
-    parser.add_argument("--cases", default="", help="part of the names of those to take")
-    parser.add_argument("--only", default="", help="case:round, done once in this process")
-    parser.add_argument("--log", type=Path)
-    parser.add_argument("--products", type=Path, help="folder for the city that a run makes")
     given = parser.parse_args(arguments)
-    with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as stack:
-        folder = Path(scratch)
-        cases = synthetic_cases(folder / "good", given.lidar, given.images)
-        if given.products:
-            gcps = [
-                replace(case, format="control points") for case in cases if case.format == "GCP CSV"
-            ]
-            cases = [*product_cases(make_tiny(given.products.absolute()).folder), gcps[0]]
-        cases = [case for case in cases if given.cases in case.name]
-        if given.only:
-            name, _, number = given.only.rpartition(":")
-            reader = Reader([case for case in cases if case.name == name], folder)
-            print(json.dumps(asdict(reader.outcome(name, int(number))), indent=1))
-            return None
-        log = stack.enter_context(given.log.open("w")) if given.log else None
-        outcomes = []
-        kinds = sorted({case.format for case in cases}) if given.products else [None]
-        for kind in kinds:
-            some = [case for case in cases if kind in (None, case.format)]
-            for outcome in rounds(some, given.mutants, given.seed, folder):
-                outcomes.append(outcome)
-                if log:
-                    print(json.dumps(asdict(outcome)), file=log, flush=True)
-        print(table(outcomes))
+    with tempfile.TemporaryDirectory() as scratch:
+        cases = synthetic_cases(Path(scratch) / "good", given.lidar, given.images)
+        print(table(list(rounds(cases, given.mutants, given.seed, Path(scratch)))))
     return None
 
 

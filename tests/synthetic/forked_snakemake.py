@@ -101,7 +101,7 @@ def _import_stages() -> None:
     """Import what the scripts do, and what that imports later."""
     for script in (forks.ROOT / "workflow" / "scripts").glob("*.py"):
         for node in ast.walk(ast.parse(script.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stereotruth"):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stereo"):
                 with suppress(ModuleNotFoundError):  # without PyTorch
                     importlib.import_module(node.module)
     for name in OF_JOBS:

@@ -11,7 +11,6 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereocities.__main__ import make_scene
 from stereocities.cities import SceneSpec
 from stereotruth.project.simulated_project import DEMO
 
@@ -154,20 +153,6 @@ def copy_project(folder: Path) -> Project:
         ignore = shutil.ignore_patterns("__pycache__", "*.egg-info")
         shutil.copytree(ROOT / name, folder / name, ignore=ignore)
     return Project(folder)
-
-
-def make_tiny(folder: Path) -> Project:
-    """A project below ``folder`` in which tiles/Tiny has been made; config in tiny.yaml."""
-    project = Project(folder / "project")
-    if (project.folder / "tiles/Tiny").is_dir():
-        return project
-    copy_project(project.folder)
-    make_scene(TINY, TINY.scenes[0], folder / "Tiny-1", spacing_m=0.4, seed=1)
-    (folder / "Tiny-1").rename(project.folder / "in")
-    project.add_scene("tiny", [row_of(Path("in"))], **SIZE)
-    run = project.snakemake("tiles/Tiny", "--configfile", "tiny.yaml")
-    assert run.status == 0, run.text[-4000:]
-    return project
 
 
 def row_of(folder: Path, **changes: str) -> dict[str, str]:

@@ -1,28 +1,20 @@
 """Runs of the workflow that are killed at random moments and carried on.
 
-    python -m tests.workflow.killing --kills 20 data/synthetic config/config.yaml tiles/Qichun
-
-makes the target twice in scratch folders, once undisturbed and once with 20 kills, and holds the
-products against each other. A kill takes the worker, snakemake alone, or all processes of the run.
+A kill takes the worker, snakemake alone, or all processes of the run.
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
 VICTIMS = ("worker", "snakemake", "tree")
 PRODUCTS = ("results/rectify", "results/project", "results/export", "tiles")
 
@@ -116,38 +108,3 @@ def disturb(
         done = now
     run = start(folder, *arguments)
     assert run.wait() == 0, (folder / "run.log").read_text()[-4000:]
-
-
-def main() -> None:
-    """See the module."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--longest", type=float, default=25.0, help="s until a kill, at most")
-    parser.add_argument("data", type=Path, help="folder of the input, as data/synthetic")
-    parser.add_argument("config", type=Path)
-    parser.add_argument("target")
-    given = parser.parse_args()
-    found = []
-    with tempfile.TemporaryDirectory(dir=given.data.parent) as scratch:
-        for kills in (0, given.kills):
-            folder = Path(scratch) / f"{kills}-kills"
-            for name in ("Snakefile", "workflow", "profiles", "envs", "config"):
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).symlink_to(ROOT / name)
-            (folder / given.data).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copytree(given.data, folder / given.data, symlinks=True)
-            begin = time.monotonic()
-            config = str(given.config.absolute())
-            arguments = [given.target, "--configfile", config]
-            for line in disturb(folder, arguments, kills, given.seed, given.longest):
-                print(line, flush=True)
-            print(f"{kills} kills: {time.monotonic() - begin:.0f} s", flush=True)
-            found.append(hashes(folder))
-    different = [name for name in found[0] | found[1] if found[0].get(name) != found[1].get(name)]
-    print(f"{len(found[0])} files, {len(different)} differ", *different[:10], sep="\n")
-    sys.exit(bool(different))
-
-
-if __name__ == "__main__":
-    main()

@@ -43,9 +43,3 @@ def test_a_limit_judges_again_and_a_changed_dataset_is_audited(later, tmp_path):
     with (audited.folder / "audit/faulty/pairs.csv").open(newline="") as stream:
         faults = {row["pair"]: row["faults"] for row in csv.DictReader(stream) if row["faults"]}
     assert faults == {rows[0]["tile"]: "left and right image are the same"}
-
-
-@pytest.mark.slow
-def test_an_unknown_dataset_is_named(tiled):
-    run = tiled.refuse("audit/nothing", *ARGUMENTS)
-    assert "no dataset 'nothing'" in run.text

@@ -114,17 +114,6 @@ def test_a_module_of_another_workflow_makes_the_same(own):
 
 
 @pytest.mark.slow
-def test_a_module_without_settings_has_the_defaults(tmp_path):
-    text = module().replace("Demo", "Qichun")
-    (tmp_path / "Snakefile").write_text(text)
-    (tmp_path / "config.yaml").write_text("tiles: {size: 512}\n")
-    jobs = Project(tmp_path).plan()
-    assert jobs["mine"] == jobs["export"] == 1 and jobs["simulate_image"] == 4
-    benchmark = Project(tmp_path).plan("benchmark/synthetic/sgm")
-    assert benchmark["match"] == benchmark["dataset"] == 1
-
-
-@pytest.mark.slow
 def test_snakemake_from_elsewhere_reads_the_defaults_and_the_folder(own, tmp_path):
     snakefile = ("--snakefile", str(ROOT / "Snakefile"))
     elsewhere = Project(tmp_path)
@@ -164,26 +153,16 @@ def in_process(monkeypatch, capsys, *arguments: str) -> Run:
 def test_errors_of_what_is_not_there(own, monkeypatch, capsys):
     monkeypatch.chdir(own)
     run = in_process(monkeypatch, capsys, "status", "Qichun")
-    assert run.status == 1 and "no city 'Qichun'" in run.text
+    assert run.status == 1 and run.text.startswith("error: ") and "no city 'Qichun'" in run.text
     run = in_process(monkeypatch, capsys, "open")
     assert run.status == 1 and "no page" in run.text
 
 
-def test_an_error_is_one_line_and_status_1(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert in_process(monkeypatch, capsys, "init", "new").status == 0
-    run = in_process(monkeypatch, capsys, "init", "new")
-    assert run.status == 1 and run.text.startswith("error: new: ")
-    monkeypatch.chdir(tmp_path / "new")
-    run = in_process(monkeypatch, capsys, "check")
-    assert run.status == 1 and "stereotruth scene add" in run.text
-
-
-@pytest.mark.parametrize("words", [[], ["run"], ["scene", "add"], ["gcps", "import"], ["check"]])
-def test_help_shows_examples(monkeypatch, capsys, words):
-    run = in_process(monkeypatch, capsys, *words, "--help")
-    assert run.status == 0 and "Examples" in run.text
-    assert " ".join(["stereotruth", *words]) in run.text
+def test_help_shows_examples(monkeypatch, capsys):
+    for words in ([], ["run"], ["scene", "add"], ["gcps", "import"], ["check"]):
+        run = in_process(monkeypatch, capsys, *words, "--help")
+        assert run.status == 0 and "Examples" in run.text
+        assert " ".join(["stereotruth", *words]) in run.text
 
 
 def test_the_command_starts_quickly(tmp_path):

@@ -24,7 +24,6 @@ STARTS = {
     "adjusted_alignment": {"numba"},
     "rectify": {"dask", "numba", "pydantic", "rasterio", "zarr"},
     "project": {"dask", "numba", "pydantic", "zarr"},
-    "project_strip": {"dask", "numba", "pydantic", "zarr"},
     "grid_truth": {"numba", "rasterio", "zarr"},
     "match": {"pydantic", "rasterio"},
 }

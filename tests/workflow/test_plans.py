@@ -20,23 +20,10 @@ def test_a_city_is_planned_from_nothing(project):
     assert jobs["ingest"] == jobs["simulate_lidar"] >= 4
 
 
-@pytest.mark.slow
-def test_all_cities_and_the_dataset_are_planned(project):
-    assert project.plan()["export"] == 6
-    assert project.plan("dataset")["dataset"] == 1
-    assert project.plan("report", "--configfile", "config/config.yaml")["report_city"] == 6
-
-
 def test_exact_truth_is_planned_by_scene_and_by_city(project):
     jobs = project.plan("evaluate")
     assert jobs["grid_truth"] == jobs["evaluate_truth"] == 7
     assert jobs["evaluate_truth_city"] == 6
-
-
-def test_a_surface_model_is_judged_against_the_scenes_lidar(project):
-    jobs = project.plan("score_dsm/Wuhan/Wuhan-1/sgm")
-    assert jobs["score_dsm"] == jobs["dsm"] == jobs["predict_scene"] == 1
-    assert jobs["ingest"] == 4
 
 
 def test_training_cities_are_planned_for_who_trains_on_them(project):
@@ -45,18 +32,6 @@ def test_training_cities_are_planned_for_who_trains_on_them(project):
     (project.folder / "more.yaml").write_text(yaml.safe_dump(config))
     jobs = project.plan("results/train/more/stereonet/best.pt", "--configfile", "more.yaml")
     assert jobs == {"training_city": 6, "training_cities": 1, "train": 1}  # 5 to train on
-
-
-@pytest.mark.slow
-def test_real_scenes_are_evaluated_by_their_images(project):
-    for name in ("left.tif", "right.tif", "points.laz", "gcps.csv"):
-        (project.folder / name).touch()
-    row = {"scene": "R-1", "city": "Real", "left_image": "left.tif", "right_image": "right.tif"}
-    config = project.add_scene("real", [row | {"lidar": "points.laz", "gcps": "gcps.csv"}])
-    jobs = project.plan("evaluate", "--configfile", config)
-    assert jobs["export"] == jobs["evaluate_images"] == 1
-    assert "grid_truth" not in jobs
-    assert project.plan("evaluate")["evaluate_images"] == 6  # synthetic cities
 
 
 @pytest.mark.parametrize(
@@ -144,12 +119,6 @@ def test_a_scene_without_gcps_is_refused_unless_it_is_refined(project):
         assert word in run.text
     jobs = project.plan("tiles/Mine", "--configfile", project.add_scene("mine", [row]))
     assert jobs["refine"] == 1
-
-
-def test_refinement_can_be_switched_off(project):
-    (project.folder / "off.yaml").write_text("alignment:\n  refine: false\n")
-    jobs = project.plan("tiles/Kunming", "--configfile", "off.yaml")
-    assert "refine" not in jobs and jobs["align"] == 1
 
 
 PACK = """

@@ -22,6 +22,7 @@ from stereotruth.lidar.footprint import Footprint
 from stereotruth.project.simulated_project import SITE
 from stereotruth.tiles.verify import defects
 
+pytestmark = pytest.mark.slow
 COMMAND = [sys.executable, "-m", "stereotruth.project.main"]
 
 
@@ -79,42 +80,7 @@ def site(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.slow
-def test_the_tiles_of_both_pairs_are_made_and_each_lidar_file_is_read_once(site):
-    check_tiles(site)
-
-
-@pytest.mark.slow
-def test_tiles_say_how_old_the_lidar_was(site):
-    check_days(site)
-
-
-@pytest.mark.slow
-def test_heights_are_the_truth_and_their_uncertainty_explains_their_errors(site):
-    check_heights(site)
-
-
-@pytest.mark.slow
-def test_crops_of_originals_have_the_heights_beside_them(site):
-    check_crops(site)
-
-
-@pytest.mark.slow
-def test_the_order_of_the_sheets_rows_plays_no_part(site, tmp_path):
-    check_order(site, tmp_path / "turned")
-
-
-@pytest.mark.slow
-def test_the_site_has_a_page_that_leads_to_its_pairs(site):
-    check_page(site)
-
-
-@pytest.mark.slow
-def test_an_image_has_one_correction_in_both_of_its_pairs(site):
-    check_corrections(site)
-
-
-def check_corrections(site: Path) -> None:
+def test_an_image_has_one_correction_in_both_of_its_pairs(site: Path) -> None:
     adjusted = json.loads((site / "results/adjust/Stack.json").read_text())["images"]
     assert len(adjusted) == 3 and not any(image["doubts"] for image in adjusted.values())
     affines: dict[str, list] = {}
@@ -128,14 +94,14 @@ def check_corrections(site: Path) -> None:
         assert all(affine == adjusted[name]["affine"] for affine in found)
 
 
-def check_tiles(site: Path) -> None:
+def test_the_tiles_of_both_pairs_are_made_and_each_lidar_file_is_read_once(site: Path) -> None:
     assert defects(site / "tiles/Stack") == []
     assert len(list((site / "results/project/Stack").glob("*.zarr"))) == 2
     stores = [path.name for path in (site / "results/ingest").rglob("*.points")]
     assert sorted(stores) == ["Stack_0_0.points", "Stack_0_1.points"]
 
 
-def check_heights(site: Path) -> None:
+def test_heights_are_the_truth_and_their_uncertainty_explains_their_errors(site: Path) -> None:
     stores = sorted((site / "results/heights/Stack").glob("*.zarr"))
     assert len(stores) == 3  # two pairs of one pass share an image
     for store in stores:
@@ -152,7 +118,7 @@ def check_heights(site: Path) -> None:
         assert 0.9 < (error < 2 * sigma).mean() < 0.98
 
 
-def check_days(site: Path) -> None:
+def test_tiles_say_how_old_the_lidar_was(site: Path) -> None:
     """From the middle of the catalogue's days to those of the images sheet."""
     with (site / "tiles/Stack/manifest.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
@@ -168,7 +134,7 @@ def check_days(site: Path) -> None:
     assert "2019-03-01 to 2019-03-05" in page and re.search(r"images [\d–]+ days later", page)
 
 
-def check_crops(site: Path) -> None:
+def test_crops_of_originals_have_the_heights_beside_them(site: Path) -> None:
     folder = site / "originals/Stack"
     assert defects(folder) == []
     names = [path.parent.name for path in (site / "results/adjust/Stack").glob("*/alignment.json")]
@@ -194,7 +160,7 @@ def check_crops(site: Path) -> None:
             assert np.median(error) < 0.02 and (error > 1.0).mean() < 0.001
 
 
-def check_page(site: Path) -> None:
+def test_the_site_has_a_page_that_leads_to_its_pairs(site: Path) -> None:
     text = (site / "results/site/Stack/index.html").read_text(encoding="utf-8")
     assert all(f"<title>{image.name} " in text for image in SITE.images)  # in the map
     assert re.findall(r'<section id="(\w+)"', text) == ["map", "images", "pairs", "residuals"]
@@ -204,8 +170,9 @@ def check_page(site: Path) -> None:
     assert "site/Stack/index.html" in (site / "results/report/index.html").read_text()
 
 
-def check_order(site: Path, other: Path) -> None:
+def test_the_order_of_the_sheets_rows_plays_no_part(site: Path, tmp_path: Path) -> None:
     """Labels, arrays and all, are the same bytes if images, scenes and points are turned round."""
+    other = tmp_path / "turned"
     other.mkdir()
     shutil.copytree(site / "data", other / "data")
     shutil.copy(site / "lidar.tsv", other)
