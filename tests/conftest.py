@@ -15,10 +15,7 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_N
 
 # Test files that processes begin with: the first makes the city of the workflow's tests and all
 # that follows from it, which the others wait for; the next ones need nothing of it.
-FIRST = (
-    *("test_audit", "test_plans", "test_job_start", "test_without_pytorch"),
-    "test_dated_scene",
-)
+FIRST = ("test_audit", "test_plans", "test_job_start")
 
 
 def pytest_collection_modifyitems(items):

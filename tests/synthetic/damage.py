@@ -29,12 +29,11 @@ WORDS = (
 )
 
 
-def truncated(data: bytes, random: Random) -> tuple[bytes, str]:
+def truncated(data: bytes, random: Random) -> bytes:
     """Cut short: anywhere, or by a few bytes."""
-    near_end = random.random() < 0.3
-    left = max(0, len(data) - 1 - int(random.integers(64))) if near_end else None
-    left = int(random.integers(len(data))) if left is None else left
-    return data[:left], f"truncated to {left} of {len(data)} bytes"
+    if random.random() < 0.3:
+        return data[: max(0, len(data) - 1 - int(random.integers(64)))]
+    return data[: int(random.integers(len(data)))]
 
 
 def _place(data: bytes, random: Random) -> int:
@@ -42,151 +41,126 @@ def _place(data: bytes, random: Random) -> int:
     return int(random.integers(min(len(data), 600) if random.random() < 0.5 else len(data)))
 
 
-def flipped(data: bytes, random: Random) -> tuple[bytes, str]:
+def _span(data: bytes, random: Random) -> tuple[int, int]:
+    start = _place(data, random)
+    return start, start + int(2 ** random.uniform(0, 12))
+
+
+def flipped(data: bytes, random: Random) -> bytes:
     """One to eight bits the other way round."""
-    out, places = bytearray(data), []
+    out = bytearray(data)
     for _ in range(int(random.integers(1, 9))):
-        at, bit = _place(data, random), int(random.integers(8))
-        out[at] ^= 1 << bit
-        places.append(at)
-    return bytes(out), f"bits flipped in bytes {sorted(places)}"
+        out[_place(data, random)] ^= 1 << int(random.integers(8))
+    return bytes(out)
 
 
-def extreme(data: bytes, random: Random) -> tuple[bytes, str]:
+def extreme(data: bytes, random: Random) -> bytes:
     """A field of 1 to 8 bytes set to a value that programs forget."""
     width = int(random.choice((1, 2, 4, 8)))
     value = EXTREMES[width][int(random.integers(len(EXTREMES[width])))]
     at = _place(data, random)
     if random.random() < 0.5:
         at -= at % min(width, 2)
-    return data[:at] + value + data[at + width :], f"bytes {at} to {at + width - 1}: {value.hex()}"
+    return data[:at] + value + data[at + width :]
 
 
-def _span(data: bytes, random: Random) -> tuple[int, int]:
-    return _place(data, random), int(2 ** random.uniform(0, 12))
-
-
-def inserted(data: bytes, random: Random) -> tuple[bytes, str]:
+def inserted(data: bytes, random: Random) -> bytes:
     """Random bytes put in."""
-    at, size = _span(data, random)
-    return data[:at] + random.bytes(size) + data[at:], f"{size} bytes inserted at {at}"
+    start, end = _span(data, random)
+    return data[:start] + random.bytes(end - start) + data[start:]
 
 
-def removed(data: bytes, random: Random) -> tuple[bytes, str]:
+def removed(data: bytes, random: Random) -> bytes:
     """Bytes taken out."""
-    at, size = _span(data, random)
-    return data[:at] + data[at + size :], f"{size} bytes removed at {at}"
+    start, end = _span(data, random)
+    return data[:start] + data[end:]
 
 
-def repeated(data: bytes, random: Random) -> tuple[bytes, str]:
+def repeated(data: bytes, random: Random) -> bytes:
     """A stretch that stands there twice."""
-    at, size = _span(data, random)
-    return data[: at + size] + data[at:], f"{size} bytes repeated at {at}"
+    start, end = _span(data, random)
+    return data[:end] + data[start:]
 
 
-def overwritten(data: bytes, random: Random) -> tuple[bytes, str]:
+def overwritten(data: bytes, random: Random) -> bytes:
     """A stretch of zeros, of ones or of noise, as of a bad disk."""
-    at, size = _span(data, random)
-    size = min(size, len(data) - at)
+    start, end = _span(data, random)
+    size = min(end, len(data)) - start
     fill = (bytes(size), b"\xff" * size, random.bytes(size))[int(random.integers(3))]
-    return data[:at] + fill + data[at + size :], f"bytes {at} to {at + size - 1} overwritten"
+    return data[:start] + fill + data[start + size :]
 
 
-def exchanged(data: bytes, random: Random) -> tuple[bytes, str]:
+def exchanged(data: bytes, random: Random) -> bytes:
     """Two stretches in each other's place."""
     size = int(2 ** random.uniform(2, 10))
     if len(data) < 2 * size:
         return truncated(data, random)
     one = int(random.integers(len(data) - 2 * size + 1))
     other = int(random.integers(one + size, len(data) - size + 1))
-    out = bytearray(data)
-    out[one : one + size], out[other : other + size] = (
-        data[other : other + size],
-        data[one : one + size],
-    )
-    return bytes(out), f"{size} bytes at {one} and at {other} exchanged"
+    parts = data[:one], data[other : other + size], data[one + size : other]
+    return b"".join((*parts, data[one : one + size], data[other + size :]))
 
 
 BYTES = (truncated, flipped, flipped, extreme, extreme, inserted, removed, repeated, overwritten)
 BYTES = (*BYTES, exchanged)
 
 
-def _lines(data: bytes) -> list[str]:
-    return data.decode("utf-8", "replace").splitlines()
+def _replaced(pattern: str, others: tuple[str, ...]) -> Callable[[bytes, Random], bytes]:
+    """What puts something else in the place of one match of a pattern."""
+
+    def replaced(data: bytes, random: Random) -> bytes:
+        text = data.decode("utf-8", "replace")
+        found = list(re.finditer(pattern, text))
+        if not found:
+            return truncated(data, random)
+        match = found[int(random.integers(len(found)))]
+        new = others[int(random.integers(len(others)))]
+        return (text[: match.start()] + new + text[match.end() :]).encode("utf-8", "surrogatepass")
+
+    return replaced
 
 
-def _joined(lines: list[str], what: str) -> tuple[bytes, str]:
-    return ("\n".join(lines) + "\n").encode("utf-8", "surrogatepass"), what
+number_replaced = _replaced(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?", NUMBERS)
+word_replaced = _replaced(r"[A-Za-z_]\w*", WORDS)
 
 
-def number_replaced(data: bytes, random: Random) -> tuple[bytes, str]:
-    """One of the numbers becomes something else."""
-    text = data.decode("utf-8", "replace")
-    found = list(re.finditer(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?", text))
-    if not found:
-        return truncated(data, random)
-    match, new = (
-        found[int(random.integers(len(found)))],
-        NUMBERS[int(random.integers(len(NUMBERS)))],
-    )
-    text = text[: match.start()] + new + text[match.end() :]
-    return text.encode(), f"{match[0]!r} at {match.start()} became {new[:30]!r}"
-
-
-def word_replaced(data: bytes, random: Random) -> tuple[bytes, str]:
-    """A name or an id becomes something else."""
-    text = data.decode("utf-8", "replace")
-    found = list(re.finditer(r"[A-Za-z_]\w*", text))
-    if not found:
-        return truncated(data, random)
-    match, new = found[int(random.integers(len(found)))], WORDS[int(random.integers(len(WORDS)))]
-    text = text[: match.start()] + new + text[match.end() :]
-    return text.encode(), f"{match[0][:30]!r} at {match.start()} became {new[:30]!r}"
-
-
-def line_changed(data: bytes, random: Random) -> tuple[bytes, str]:
-    """Lines lost, doubled, moved, doubled under another name, or thousands of empty ones."""
-    lines = _lines(data) or [""]
+def line_changed(data: bytes, random: Random) -> bytes:
+    """Lines lost, doubled, moved, under another name, endless, or thousands of empty ones."""
+    lines = data.decode("utf-8", "replace").splitlines() or [""]
     at, to = (int(v) for v in random.integers(len(lines), size=2))
-    kind = int(random.integers(7))
-    if kind == 0:
-        return _joined(lines[:at] + lines[at + 1 :], f"line {at + 1} removed")
-    if kind == 1:
-        return _joined([*lines[:at], lines[at], *lines[at:]], f"line {at + 1} doubled")
-    if kind == 2:
-        lines[at], lines[to] = lines[to], lines[at]
-        return _joined(lines, f"lines {at + 1} and {to + 1} exchanged")
-    if kind == 3:
-        again = "N" + lines[at]
-        return _joined([*lines, again], f"line {at + 1} again under another name")
-    if kind == 4:
-        empty = int(10 ** random.uniform(2, 5.3))
-        blank = (" ", "", "\t")[int(random.integers(3))]
-        return _joined([*lines[:at], *[blank] * empty, *lines[at:]], f"{empty} blank lines")
-    if kind == 5:
-        long = (" ", "(", "a", ",", "=", "-", "\n ")[int(random.integers(7))]
-        size = int(10 ** random.uniform(2, 5.3))
-        return _joined([*lines[:at], long * size, *lines[at:]], f"{size} times {long!r}")
-    lines[at] = lines[at].swapcase()
-    return _joined(lines, f"line {at + 1} in other case")
+    many = int(10 ** random.uniform(2, 5.3))
+    match int(random.integers(7)):
+        case 0:
+            del lines[at]
+        case 1:
+            lines.insert(at, lines[at])
+        case 2:
+            lines[at], lines[to] = lines[to], lines[at]
+        case 3:
+            lines.append("N" + lines[at])
+        case 4:
+            lines[at:at] = [(" ", "", "\t")[int(random.integers(3))]] * many
+        case 5:
+            lines.insert(at, (" ", "(", "a", ",", "=", "-", "\n ")[int(random.integers(7))] * many)
+        case _:
+            lines[at] = lines[at].swapcase()
+    return ("\n".join(lines) + "\n").encode("utf-8", "surrogatepass")
 
 
-def recoded(data: bytes, random: Random) -> tuple[bytes, str]:
+def recoded(data: bytes, random: Random) -> bytes:
     """Another encoding, line ends or separators."""
     text = data.decode("utf-8", "replace")
     kind = int(random.integers(6))
     if kind < 3:
-        name = ("utf-16", "utf-8-sig", "cp1252")[kind]
-        return text.encode(name, "replace"), f"in {name}"
-    old, new = ((",", ";"), (".", ","), ("\n", "\r\r\n"))[kind - 3]
-    return text.replace(old, new).encode(), f"{old!r} became {new!r}"
+        return text.encode(("utf-16", "utf-8-sig", "cp1252")[kind], "replace")
+    return text.replace(*((",", ";"), (".", ","), ("\n", "\r\r\n"))[kind - 3]).encode()
 
 
 TEXT = (number_replaced, number_replaced, number_replaced, word_replaced, line_changed)
 TEXT = (*TEXT, line_changed, recoded, truncated, flipped, removed, repeated, exchanged)
 
 
-def damaged(data: bytes, seed: int, ways: tuple[Callable, ...] = BYTES) -> tuple[bytes, str]:
-    """The file with one kind of damage, and what was done; the same for the same seed."""
+def damaged(data: bytes, seed: int, ways: tuple[Callable, ...] = BYTES) -> bytes:
+    """The file with one kind of damage; the same for the same seed."""
     random = np.random.default_rng(seed)
     return ways[int(random.integers(len(ways)))](data, random)

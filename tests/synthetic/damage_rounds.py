@@ -9,19 +9,16 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
-import os
+import multiprocessing
 import resource
-import select
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +29,6 @@ from stereotruth.align.align_figure import draw_residuals
 from stereotruth.align.align_report import write_alignment
 from stereotruth.align.gcp_checks import open_view
 from stereotruth.core.errors import InputError
-from stereotruth.core.job import in_own_process
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.sensor.image_reader import Source
@@ -45,6 +41,8 @@ SECONDS = 30.0
 # What may come of a mutant; the first four are as they should be, the last five are not.
 FINE = ("refused", "right", "remarked", "cannot be told")
 REST = ("other values", "other file named", "traceback", "abort", "hang")
+FORK = multiprocessing.get_context("fork")
+Read = tuple[Any, list[str]]  # what a file holds, and remarks
 
 
 @dataclass(frozen=True)
@@ -54,14 +52,9 @@ class Outcome:
     format: str
     case: str
     round: int
-    what: str
     came: str
     says: str = ""
     seconds: float = 0.0
-    mib: int = 0
-
-
-# ------------------------------------------------------------------ in the worker: one file read
 
 
 def _digest(*arrays: np.ndarray) -> str:
@@ -71,17 +64,17 @@ def _digest(*arrays: np.ndarray) -> str:
     return found.hexdigest()
 
 
-def _read_lidar(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
+def _read_lidar(case: Case, file: Path, folder: Path) -> Read:
     store = folder / "store.points"
     shutil.rmtree(store, ignore_errors=True)
-    summary = apart(lambda: ingest(file, store, **case.options), file)
+    summary = ingest(file, store, **case.options)
     points = PointStore(store)
     found = points.query(*points.bounds[:4])
     value = _digest(found.lon_q, found.lat_q, found.h_q, found.classification, found.return_number)
     return value, summary["notes"]
 
 
-def _read_image(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
+def _read_image(case: Case, file: Path, folder: Path) -> Read:
     sensor, size = open_view("left", file, "")
     with Source(file) as source:
         source.check_blocks()  # as rectify does
@@ -91,7 +84,7 @@ def _read_image(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
     return [_digest(pixels), str(pixels.shape), _digest(sensor.packed())], []
 
 
-def _aligned(images: tuple[Path, Path], gcps: Path, folder: Path) -> tuple[Any, list[str]]:
+def _aligned(images: tuple[Path, Path], gcps: Path, folder: Path) -> Read:
     """Where the corrected RPCs take fixed places on the ground, px."""
     found = align(*images, gcps, scene="damaged", provenance={})
     ids = {g.id for fit in found.fits for g in fit.gcps}
@@ -105,11 +98,11 @@ def _aligned(images: tuple[Path, Path], gcps: Path, folder: Path) -> tuple[Any, 
     return np.round(np.array(places), 2).tolist(), list(found.warnings)
 
 
-def _read_gcps(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
+def _read_gcps(case: Case, file: Path, folder: Path) -> Read:
     return _aligned((case.file.parent / "left.tif", case.file.parent / "right.tif"), file, folder)
 
 
-def _read_rpc(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
+def _read_rpc(case: Case, file: Path, folder: Path) -> Read:
     image = file.parent / "left.tif"
     if not image.exists():
         image.symlink_to(case.file.parent / "left.tif")
@@ -117,172 +110,88 @@ def _read_rpc(case: Case, file: Path, folder: Path) -> tuple[Any, list[str]]:
     return _aligned((image, case.file.parent / "right.tif"), gcps, folder)
 
 
-def _here(work: Callable[[], Any], file: Path) -> Any:
-    return work()
-
-
-# How ingest is called: the rule does so in a process of its own. Here only mutants are that end
-# the worker, for the sake of time.
-apart: Callable[[Callable[[], Any], Path], Any] = _here
 READERS = {"lidar": _read_lidar, "image": _read_image, "gcps": _read_gcps, "rpc": _read_rpc}
 
 
-class Reader:
-    """Reads mutants of good files, and compares with what the good ones give."""
-
-    def __init__(self, cases: Iterable[Case], folder: Path) -> None:
-        self.folder = folder
-        self.cases = {case.name: case for case in cases}
-        self.good = {name: self._read(case, case.file) for name, case in self.cases.items()}
-        limit = _kib("VmSize:") * 1024 + MEMORY
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-    def _read(self, case: Case, file: Path) -> tuple[Any, list[str]]:
-        return READERS[case.reader](case, file, self.folder)
-
-    def outcome(self, name: str, number: int) -> Outcome:
-        case = self.cases[name]
-        ways = damage.TEXT if case.text else damage.BYTES
-        data, what = damage.damaged(case.file.read_bytes(), number, ways)
-        folder = self.folder / "mutant"
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        file = folder / case.file.name
-        file.write_bytes(data)
-        Path("/proc/self/clear_refs").write_text("5")
-        before, begun, says = _kib("VmRSS:"), time.monotonic(), ""
-        try:
-            value, remarks = self._read(case, file)
-        except InputError as error:
-            says = str(error)
-            named = file.name in says and "Remedy" in says
-            came = "refused" if named else "other file named"
-        except BaseException as error:
-            if isinstance(error, KeyboardInterrupt):
-                raise
-            came, says = "traceback", "".join(traceback.format_exception(error)[-4:])
-        else:
-            good, usual = self.good[name]
-            new = [text for text in remarks if text not in usual]
-            came, says = "right" if value == good else "remarked", "; ".join(new)
-            if came == "remarked" and not new:
-                hidden = case.cannot_be_told(data, value, good)
-                came = "cannot be told" if hidden else "other values"
-        children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss  # the most so far
-        most = max(_kib("VmHWM:"), children) - before
-        seconds, mib = time.monotonic() - begun, max(0, most) // 1024
-        return Outcome(case.format, name, number, what, came, says[:600], round(seconds, 2), mib)
+def _report(
+    case: Case, good: tuple[Any, list[str]], number: int, folder: Path, sending: Any
+) -> None:
+    """In a fork with a bound on its memory: read a mutant, and send what comes of it."""
+    limit = _vm_bytes() + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    data = damage.damaged(
+        case.file.read_bytes(), number, damage.TEXT if case.text else damage.BYTES
+    )
+    file = folder / case.file.name
+    file.write_bytes(data)
+    try:
+        value, remarks = READERS[case.reader](case, file, folder)
+    except InputError as error:
+        named = file.name in str(error) and "Remedy" in str(error)
+        sending.send(("refused" if named else "other file named", str(error)))
+    except BaseException as error:
+        sending.send(("traceback", "".join(traceback.format_exception(error)[-4:])))
+    else:
+        new = [text for text in remarks if text not in good[1]]
+        came = "right" if value == good[0] else "remarked"
+        if came == "remarked" and not new:
+            hidden = case.cannot_be_told(data, value, good[0])
+            came = "cannot be told" if hidden else "other values"
+        sending.send((came, "; ".join(new)))
 
 
-def _kib(field: str) -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(field):
-            return int(line.split()[1])
-    return 0
+def _vm_bytes() -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmSize:"))
 
 
-def _work(cases_file: str, folder: str) -> None:
-    global apart
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what libraries print is no answer
-    cases = [Case.from_dict(case) for case in json.loads(Path(cases_file).read_text())]
-    reader = Reader(cases, Path(folder))
-    print("ready", file=answers, flush=True)
-    for line in sys.stdin:
-        name, number, once_more = json.loads(line)
-        apart = in_own_process if once_more else _here
-        print(json.dumps(asdict(reader.outcome(name, number))), file=answers, flush=True)
+def outcome(case: Case, good: Read, number: int, folder: Path) -> Outcome:
+    """What comes of one mutant, whatever it does to its process.
 
-
-# ------------------------------------------------------------------ outside: many files
-
-
-class Worker:
-    """A process that reads mutants; started again after each that it does not outlive."""
-
-    def __init__(self, cases: list[Case], folder: Path) -> None:
-        self.cases = {case.name: case for case in cases}
-        self.folder = Path(tempfile.mkdtemp(dir=folder))
-        self.list = self.folder / "cases.json"
-        self.list.write_text(json.dumps([case.to_dict() for case in cases]))
-        self.process: subprocess.Popen | None = None
-
-    def _start(self) -> None:
-        command = [sys.executable, "-m", __spec__.name, "--worker", self.list, self.folder]
-        with (self.folder / "stderr").open("w") as errors:
-            self.process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
-            )
-        if self._answer(300.0) != "ready":
-            raise RuntimeError((self.folder / "stderr").read_text()[-2000:])
-
-    def _answer(self, seconds: float) -> str | None:
-        """The next line; None: it took too long; empty: the process has ended."""
-        if not select.select([self.process.stdout], [], [], seconds)[0]:
-            return None
-        return self.process.stdout.readline().strip()
-
-    def outcome(self, name: str, number: int, once_more: bool = False) -> Outcome:
-        """What comes of one mutant, whatever it does to the process."""
-        if self.process is None:
-            self._start()
-        self.process.stdin.write(json.dumps([name, number, once_more]) + "\n")
-        self.process.stdin.flush()
-        answer = self._answer(SECONDS)
-        if answer:
-            return Outcome(**json.loads(answer))
-        case = self.cases[name]
-        ways = damage.TEXT if case.text else damage.BYTES
-        what = damage.damaged(case.file.read_bytes(), number, ways)[1]
-        if answer is None:
-            came, says = "hang", f"killed after {SECONDS:g} s"
-        else:
-            self.process.wait()
-            came, says = "abort", (self.folder / "stderr").read_text()[-600:]
-        self.close()
-        if came == "abort" and not once_more and case.reader == "lidar":
-            return self.outcome(name, number, once_more=True)
-        seconds = SECONDS if came == "hang" else 0.0
-        return Outcome(case.format, name, number, what, came, says, seconds)
-
-    def close(self) -> None:
-        """End the process."""
-        if self.process is not None:
-            self.process.kill()
-            self.process.wait()
-            self.process.stdin.close()
-            self.process.stdout.close()
-        self.process = None
+    A decoder that crashes is no fault: the rule ingest decodes in a process of its own.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    receiving, sending = FORK.Pipe(duplex=False)
+    begun = time.monotonic()
+    process = FORK.Process(target=_report, args=(case, good, number, folder, sending))
+    process.start()
+    sending.close()
+    try:
+        came, says = receiving.recv() if receiving.poll(SECONDS) else ("hang", "")
+    except EOFError:
+        came, says = "refused" if case.reader == "lidar" else "abort", "the process has ended"
+    process.kill()
+    process.join()
+    seconds = round(time.monotonic() - begun, 2)
+    return Outcome(case.format, case.name, number, came, says[:600], seconds)
 
 
 def rounds(cases: list[Case], mutants: int, seed: int, folder: Path) -> Iterator[Outcome]:
     """Outcomes of so many mutants in all, the cases by turns."""
-    worker = Worker(cases, folder)
-    try:
-        for k in range(mutants):
-            yield worker.outcome(cases[k % len(cases)].name, seed * 1_000_000 + k)
-    finally:
-        worker.close()
+    good = {case.name: READERS[case.reader](case, case.file, folder) for case in cases}
+    for k in range(mutants):
+        case = cases[k % len(cases)]
+        yield outcome(case, good[case.name], seed * 1_000_000 + k, folder / "mutant")
 
 
 def table(outcomes: list[Outcome]) -> str:
     """Markdown: how many mutants of each format came to what."""
     kinds = (*FINE, *REST)
-    head = "| format | tried | " + " | ".join(kinds) + " | longest, s | most, MiB |"
-    lines = [head, "|" + "---|" * (len(kinds) + 4)]
+    head = "| format | tried | " + " | ".join(kinds) + " | longest, s |"
+    lines = [head, "|" + "---|" * (len(kinds) + 3)]
     for name in [*dict.fromkeys(o.format for o in outcomes), "all"]:
         of = [o for o in outcomes if name in (o.format, "all")]
         count = Counter(o.came for o in of)
         cells = [name, len(of), *(count[kind] for kind in kinds)]
-        cells += [f"{max(o.seconds for o in of):.1f}", max(o.mib for o in of)]
+        cells += [f"{max(o.seconds for o in of):.1f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
 
 
 def main(arguments: list[str]) -> None:
-    if arguments[:1] == ["--worker"]:
-        return _work(*arguments[1:])
+    """See the module."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--mutants", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
@@ -292,7 +201,6 @@ def main(arguments: list[str]) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         cases = synthetic_cases(Path(scratch) / "good", given.lidar, given.images)
         print(table(list(rounds(cases, given.mutants, given.seed, Path(scratch)))))
-    return None
 
 
 if __name__ == "__main__":

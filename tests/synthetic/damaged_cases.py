@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +30,6 @@ class Case:
     text: bool = False
     checksums: bool = False  # of its data, within the format
     options: dict[str, Any] = field(default_factory=dict)
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self) | {"file": str(self.file)}
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Case:
-        return cls(**values | {"file": Path(values["file"])})
 
     def cannot_be_told(self, data: bytes, value: Any, good: Any) -> bool:
         """Whether nothing in the damaged file ``data`` tells of the damage.

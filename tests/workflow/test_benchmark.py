@@ -80,34 +80,6 @@ def test_a_user_s_function_and_results_are_compared_with_sgm(later, tmp_path):
     assert jobs == {"match": 1, "score": 1, "benchmark_tables": 1, "benchmark": 1}
 
 
-@pytest.mark.slow
-def test_without_a_choice_what_needs_no_training_is_compared(project):
-    """SGM, functions, folders and networks with weights; the others are named."""
-    for name in ("far", "theirs"):
-        (project.folder / name).mkdir()
-    for name in ("mine.py", "net.pt"):
-        (project.folder / name).touch()
-    far = {"root": "far", "layout": "us3d", "disparity_range": [-96, 96]}
-    methods = {
-        "mine": {"kind": "function", "function": "mine.py:match"},
-        "theirs": {"kind": "folder", "folder": "theirs"},
-        "trained": {"kind": "stereonet", "weights": "net.pt"},
-    }
-    own = {"datasets": {"far": far, "synthetic": None}, "methods": methods}
-    for change in ({}, {"sgm": None, "mine": None, "theirs": None, "trained": None}):
-        own["methods"] |= change
-        (project.folder / "far.yaml").write_text(yaml.safe_dump({"benchmark": own}))
-        run = project.snakemake("--dry-run", "benchmark", "--configfile", "far.yaml")
-        if not change:
-            assert run.status == 0, run.text
-            assert run.jobs == {"match": 4, "score": 4, "benchmark_tables": 1, "benchmark": 1}
-            assert run.text.count("Left out on far") == 1
-            assert "trained first: stereonet, psmnet, hmsmnet. To" in run.text
-        else:
-            assert run.status != 0
-            assert "benchmark.datasets.far: no method that needs no training" in run.text
-
-
 def test_a_wrong_name_ends_before_any_work(project):
     far = {"root": "/nowhere", "layout": "us3d", "disparity_range": [-96, 96]}
     config = {"benchmark": {"datasets": {"far": far}}}

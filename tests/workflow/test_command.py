@@ -48,24 +48,6 @@ def own(made, tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_project_is_checked_and_carried_on(own):
-    """With tiles of another size; what was copied serves, and is not made again."""
-    checked = call("check", folder=own)
-    assert checked.status == 0, checked.text
-    assert "0 errors" in checked.text and "a run can begin" in checked.text
-    Project(own).edit("config.yaml", "size: 128", "size: 192")
-    made = call("run", "tiles/Tiny", "--cores", "2", folder=own)
-    assert made.status == 0, made.text[-4000:]
-    assert made.jobs == {"export": 1}
-    assert "Look at tiles/Tiny/manifest.csv" in made.text
-    tiles = list((own / "tiles/Tiny/disp").glob("*.tiff"))
-    assert tiles
-    assert {p.name for p in own.iterdir()} >= {"config.yaml", "tiles", "results", "logs"}
-    status = call("status", folder=own)
-    assert "up to date" in status.text and f"{len(tiles)} tiles" in status.text, status.text
-
-
-@pytest.mark.slow
 def test_the_example_is_checked_and_made(tmp_path):
     """In a folder that was empty."""
     demo = tmp_path / "demo"

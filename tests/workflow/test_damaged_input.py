@@ -18,7 +18,6 @@ def test_mutants_are_refused_or_right_or_cannot_be_told(tmp_path) -> None:
     outcomes = list(rounds(cases, 600, 20260, tmp_path))
     assert [o for o in outcomes if o.came in REST] == []
     assert max(o.seconds for o in outcomes) < 30
-    assert max(o.mib for o in outcomes) < 2048
     assert {"refused", "right", "cannot be told"} <= {o.came for o in outcomes}
 
 

@@ -18,7 +18,6 @@ import pytest
 import yaml
 
 from ..synthetic.hollow_workflow import GO_ON, Hollow
-from ..synthetic.project import row_of
 
 pytestmark = pytest.mark.slow
 STRIPS = {"rectify": {"rectify_strip"}, "project": {"project_strip"}}
@@ -186,42 +185,3 @@ def test_a_late_job_of_a_killed_run_is_waited_for(made):
     assert time.monotonic() - begin > 4.0
     assert made.stale() == []
     assert made.plan() == set()
-
-
-SCENES = ("Own-1", "Own-2", "Own-3")  # two that share an image, and one of images of its own
-
-
-def test_control_points_make_their_group_again_and_no_other_pair(tmp_path):
-    """Labels of a site's pairs: none of them reads LiDAR again."""
-    labels = [f"results/project/Own/{scene}.zarr" for scene in SCENES]
-    site = Hollow(tmp_path / "project", (*labels, "--configfile", "site.yaml"))
-    for name in ("third.tif", "other_left.tif", "other_right.tif", "other.csv"):
-        (site.folder / "in" / name).write_text(f"{name}\n")
-    first = row_of(Path("in"), scene="Own-1", city="Own")
-    second = first | {"scene": "Own-2", "right_image": "in/third.tif"}
-    images = {f"{view}_image": f"in/other_{view}.tif" for view in ("left", "right")}
-    third = first | images | {"scene": "Own-3", "gcps": "in/other.csv"}
-    site.project.add_scene("site", [first, second, third])
-    site.make()
-
-    def scenes_of(file: str) -> dict[str, list[str]]:
-        site.edit(file)
-        site.make()
-        said = site.said()
-        return {
-            stage: [scene for scene in SCENES if f"{words} scene {scene}" in said]
-            for stage, words in SAID.items()
-        }
-
-    group, alone = ["Own-1", "Own-2"], ["Own-3"]
-    assert scenes_of("in/gcps.csv") == {stage: group for stage in SAID} | {"ingest": []}
-    assert scenes_of("in/other.csv") == {stage: alone for stage in SAID} | {"ingest": []}
-
-
-SAID = {
-    "ingest": "Reading LiDAR file 1 of",
-    "align": "Aligning",
-    "refine": "Refining the alignment of",
-    "rectify": "Making epipolar images of",
-    "project": "Projecting the point cloud of",
-}

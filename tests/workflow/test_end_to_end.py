@@ -194,15 +194,6 @@ def test_the_right_view_is_a_second_product(made, both_views):
     assert (miss < 0.2).mean() > 0.95
 
 
-def test_the_dataset_has_the_published_layout(later):
-    root = later.folder / "dataset"
-    labelled = [row for row in manifest(later) if row["split"] in ("train", "val", "test")]
-    for kind in ("left", "right", "disp"):
-        files = list(root.glob(f"with ground truth/*/{kind}/*.tiff"))
-        assert len(files) == len(labelled)
-    assert (root / "without ground truth/left").is_dir()
-
-
 # ------------------------------------------------------------------------ what a user gets wrong
 
 

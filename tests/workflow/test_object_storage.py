@@ -18,7 +18,6 @@ import pytest
 from stereotruth.core.errors import InputError
 from stereotruth.core.products import remote_files
 from stereotruth.core.products.file_parts import open_stream
-from stereotruth.core.products.grids import open_grid
 from stereotruth.core.products.rasters import open_raster
 
 from ..synthetic.object_storage import BUCKET, Server, serving
@@ -117,21 +116,6 @@ def test_another_checkout_plans_nothing_and_then_what_an_edit_touches(stored, da
     points.write_text("".join(lines[:-1]))
     due = {"align", "refine", "rectify", "project", "export"}
     assert set(fresh.plan(*CALL, *STORED)) == due
-
-
-def test_xarray_opens_the_products_from_the_bucket(made, stored):
-    import xarray as xr
-
-    for product in ("project/Tiny/Tiny-1.zarr", "rectify/Tiny/Tiny-1/left.zarr"):
-        here = open_grid(made.folder / "results" / product)
-        with xr.open_zarr(
-            f"s3://{BUCKET}/tiny/results/{product}", mask_and_scale=False, chunks=None
-        ) as there:
-            assert set(there) == set(here)
-            name = "disparity" if "disparity" in here else "image"
-            part = np.s_[100:300, 50:250]
-            assert np.array_equal(there[name][part], here[name][part], equal_nan=True)
-            assert there.attrs["provenance"] == here.attrs["provenance"]
 
 
 @pytest.fixture(scope="module")

@@ -68,22 +68,6 @@ def test_a_forgotten_configuration_is_thought_of(project):
     assert "FILE" not in run.text  # it was not forgotten
 
 
-@pytest.mark.slow
-def test_a_report_plans_no_city_that_nobody_asked_for(project):
-    run = project.snakemake("--dry-run", "report")
-    assert run.status != 0
-    for word in ("no city of it has tiles", "add --configfile FILE if it was forgotten"):
-        assert word in run.text
-    (project.folder / "tiles/Qichun").mkdir(parents=True)
-    assert project.plan("report")["report_city"] == 1
-    row = {"scene": "Mine-1", "city": "Mine"}
-    for name in ("left_image", "right_image", "lidar", "gcps"):
-        (project.folder / f"{name}.laz").touch()
-        row[name] = f"{name}.laz"
-    mine = project.add_scene("mine", [row])
-    assert project.plan("report", "--configfile", mine)["report_city"] == 1
-
-
 def test_a_missing_file_is_named(project, monkeypatch):
     """By what a plan asks of each scene, and by a plan."""
     row = {"scene": "Mine-1", "city": "Mine"}

@@ -42,14 +42,9 @@ def test_a_scene_becomes_disparities_and_a_surface_model(later):
     assert TINY.base_height_m - 5 < np.ma.median(heights) < TINY.base_height_m + 30
 
 
-def test_a_resolution_makes_only_the_model(later):
-    project = later
-    (project.folder / "coarse.yaml").write_text("predict:\n  dsm:\n    resolution_m: 2.0\n")
-    jobs = project.plan(TARGET, *ARGUMENTS, "coarse.yaml")
-    assert jobs == {"dsm": 1}
-
-
 def test_the_surface_model_is_judged(later):
+    (later.folder / "coarse.yaml").write_text("predict: {dsm: {resolution_m: 2.0}}\n")
+    assert later.plan(TARGET, *ARGUMENTS, "coarse.yaml") == {"dsm": 1}
     folder = later.folder / "score_dsm/Tiny/Tiny-1/sgm"
     found = json.loads((folder / "scores.json").read_text())
     assert abs(found["registration"]["up_m"]) < 1.0

@@ -54,31 +54,6 @@ def test_a_run_that_is_killed_again_and_again_gives_the_same_bytes(made, fresh):
 
 
 @linux
-def test_control_points_edited_between_kill_and_restart(made, fresh, begin):
-    """What was made with the old ones counts for nothing; what does not follow from them stays.
-
-    The run that was not killed has one core, and gives the same bytes.
-    """
-    run = begin()
-    work = fresh.folder / "results/project/Tiny/.Tiny-1.zarr.work"
-    wait_for(lambda: work.exists() or run.poll() is not None)
-    kill(run, "tree")
-    gcps = fresh.folder / "in/gcps.csv"
-    lines = gcps.read_text().splitlines()
-    cells = lines[1].split(",")
-    cells[4] = str(float(cells[4]) + 1.5)
-    lines[1] = ",".join(cells)
-    gcps.write_text("\n".join(lines) + "\n")
-    plan = fresh.plan(*ARGUMENTS)
-    assert "ingest" not in plan and {"align", "rectify", "project"} <= set(plan)
-    assert fresh.snakemake(*ARGUMENTS).status == 0
-    other = fresh.copy(fresh.folder.with_name("other"), without=MADE)
-    assert other.snakemake(*ARGUMENTS, cores=1).status == 0
-    assert hashes(fresh.folder) == hashes(other.folder)
-    assert hashes(fresh.folder) != hashes(made.folder)
-
-
-@linux
 def test_a_second_run_is_refused_until_the_first_has_ended(made, fresh, begin):
     run = begin()
     lock = fresh.folder / ".snakemake/run.lock"

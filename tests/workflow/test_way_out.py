@@ -48,10 +48,9 @@ def test_the_dataset_has_the_forms_that_are_asked_for(complete):
         assert (complete.folder / "dataset" / file).is_file() == (catalog in FORMS["catalogs"])
     with rasterio.open(complete.folder / "results/export/Tiny/quick_looks/Tiny-1_left.tif") as look:
         assert look.crs.is_projected and look.count == 4
-
-
-@pytest.mark.slow
-def test_a_second_call_makes_nothing_again(complete):
+    root = complete.folder / "dataset"
+    assert len(list(root.glob("with ground truth/*/disp/*.tiff"))) == len(names)
+    assert (root / "without ground truth/left").is_dir()
     assert complete.plan("dataset", "--configfile", "tiny.yaml", "forms.yaml") == {}
 
 

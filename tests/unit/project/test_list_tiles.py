@@ -14,12 +14,9 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
-import yaml
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.products import remote_files
-from stereotruth.core.products.file_parts import open_stream
-from stereotruth.core.products.remote_files import url_of
 from stereotruth.lidar.catalogue_list import read_list
 from stereotruth.lidar.ingest import ingest
 from stereotruth.project.add_scene import add_scene
@@ -194,16 +191,6 @@ def test_lists_of_different_systems_are_not_mixed(folder):
         read_scenes(configured()[0])
 
 
-def test_a_list_of_another_ground_is_told_by_check(folder):
-    list_of_scenes(catalogue(folder, items_of(folder)), "a.tsv", [])
-    write_sheet(folder, lidar="a.tsv")
-    assert not any("other scenes" in f.text for f in check_project(names=["Good-1"])[0])
-    settings = yaml.safe_load(Path("config.yaml").read_text())
-    Path("config.yaml").write_text(yaml.safe_dump(settings | {"ingest": {"margin_m": 900}}))
-    doubts = [f.text for f in check_project(names=["Good-1"])[0]]
-    assert any("km² of the ground of scene Good-1: write it again" in text for text in doubts)
-
-
 def add_with(folder: Path, catalogue: str) -> list[str]:
     """Add the good scene once more, as Good-2."""
     (folder / "named").mkdir()
@@ -280,25 +267,6 @@ def with_catalogue(site: Site, folder: Path, change=lambda item: None) -> str:
     return f"{site.url}/lidar/tiles.json"
 
 
-def test_tiles_of_a_server_are_listed_and_read_as_they_were(folder):
-    with serving() as site:
-        list_of_scenes(with_catalogue(site, folder), "a.tsv", [])
-        write_sheet(folder, lidar="a.tsv")
-        settings = configured()[0]
-        site.asked.clear()
-        _, scenes = read_scenes(settings)
-        files = list(lidar_of(scenes["Good-1"], settings).values())
-        assert site.asked == []  # a plan asks nobody
-        for file in files:
-            name = url_of(file).rpartition("/")[2]
-            with open_stream(file, keep=False) as stream:
-                assert stream.read() == (folder / "tiles" / name).read_bytes()
-        name = url_of(files[0]).rpartition("/")[2]
-        site.answers[f"/lidar/{name}"] += b"more"
-        with pytest.raises(InputError, match="changed on its server"):
-            open_stream(files[0], keep=False).read(4)
-
-
 def listed(url, hosts=()):
     return list_of_scenes(url, "a.tsv", [], hosts=hosts)
 
@@ -345,21 +313,6 @@ def test_a_tile_that_its_server_redirects_or_refuses_is_not_listed(folder, monke
             assert ("is not there" in str(refused.value)) == (answer[0] == 404)
             assert "verysecret" not in str(refused.value) and not Path("a.tsv").exists()
         assert other.asked == []
-
-
-def test_signed_urls_of_a_catalogue_are_refused_without_their_signature(folder):
-    with serving() as site:
-
-        def signed(one):
-            one["assets"]["data"]["href"] += "?X-Amz-Signature=verysecret"
-
-        url = with_catalogue(site, folder, signed)
-        with pytest.raises(InputError, match="a URL with a query") as refused:
-            listed(url)
-        assert "verysecret" not in str(refused.value)
-        with pytest.raises(InputError) as refused:
-            listed(url + "?token=verysecret")
-        assert "verysecret" not in str(refused.value)
 
 
 @pytest.mark.parametrize("status", [403, 500, 503])

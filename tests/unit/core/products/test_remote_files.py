@@ -207,14 +207,6 @@ def test_a_damaged_copy_is_fetched_again():
             assert open_parts(place).get([(100, 900)]) == [CONTENT[100:900]]
 
 
-def test_what_no_server_names_and_what_is_read_once_is_not_kept():
-    """Without an ETag or a time nobody can tell whether a copy is still that of the file."""
-    with serving(CONTENT) as server:
-        assert open_parts(server.stand_in(content="")).get([(0, 9)]) == [CONTENT[:9]]
-        assert open_parts(server.stand_in(), keep=False).get([(0, 9)]) == [CONTENT[:9]]
-    assert not FOLDER.exists()
-
-
 def test_the_folder_keeps_its_limit():
     with serving(CONTENT) as server:
         parts = open_parts(server.stand_in())
