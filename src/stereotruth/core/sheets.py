@@ -6,7 +6,6 @@ the sheet, the row and the remedy.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import os
 import re
@@ -15,9 +14,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields
 from datetime import date, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints
+from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, model_validator
 from pydantic.dataclasses import dataclass
 
 from .config.section import (
@@ -32,7 +31,7 @@ from .config.section import (
     check,
     name_of,
 )
-from .errors import InputError
+from .errors import InputError, did_you_mean
 from .tables import Mistakes, Table, acquisition_time, epoch_year, require_unique
 
 MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s
@@ -41,7 +40,31 @@ RASTER_SUFFIXES = (".tif", ".tiff")  # of surface models
 LIDAR_SEPARATOR = ";"
 
 
-Count = Annotated[Whole, Field(ge=0)]
+def _count(cell: str | int) -> int:
+    if not re.fullmatch(r"[0-9]{1,9}", str(cell)):
+        raise ValueError("is no whole number, 0 or more")
+    return int(cell)
+
+
+def _epoch(text: str) -> str:
+    epoch_year(text)
+    return text
+
+
+def _time(text: str) -> str:
+    if text:
+        acquisition_time(text)
+    return text
+
+
+def _degrees(cell: str | float | None) -> float | None:
+    return None if cell in ("", None) else float(cell)
+
+
+Count = Annotated[Whole, BeforeValidator(_count)]
+Azimuth = Annotated[Number, Field(ge=0, le=360)]
+Elevation = Annotated[Number, Field(gt=0, le=90)]
+EpochCell = Annotated[Text, AfterValidator(_epoch)]
 Given = Annotated[FilePath, StringConstraints(min_length=1)]
 
 
@@ -65,7 +88,7 @@ class City:
     testing: Count
     """likewise"""
 
-    epoch: Text = ""
+    epoch: EpochCell = ""
     """optional column: epoch of the city's places in ITRF2020, as `2020.8` or `2020-10-25`; empty:
     the day of the images of its first scene that tell one, or else 2020.0. Control points without a
     frame of their own are of this epoch. See docs/explanation/frames.md"""
@@ -110,7 +133,7 @@ class Scene:
     images lie on the LiDAR: the attribute `alignment_sigma_px` of the scene's disparity store says
     how well"""
 
-    lidar_epoch: Text = ""
+    lidar_epoch: EpochCell = ""
     """optional column: epoch of the LiDAR's coordinates, as `2016.4` or `2016-05-27`, which systems
     of a dynamic frame (ITRF2014, WGS 84 (G1762)) need where the files do not state it; in WGS 84
     without a realisation empty means the epoch of the images. Coordinates in a frame that moves
@@ -146,20 +169,29 @@ class Image:
     """the image with its RPC metadata, as in `left_image` of the scenes sheet; each file stands in
     one row"""
 
-    acquired: Text = ""
+    acquired: Annotated[Text, AfterValidator(_time)] = ""
     """optional: date (`2020-10-25`), or time with its zone (`2020-10-25T03:12:45Z`, `…+08:00`);
     empty: as the delivery says it (IMD, DIMAP, GF-7 XML, STAC, tags of the file)"""
 
-    sun_azimuth: Number | None = None
+    sun_azimuth: Annotated[Azimuth | None, BeforeValidator(_degrees)] = None
     """optional: direction to the sun, degrees from north over east; empty: as the delivery says it,
     or else computed from `acquired` and the image's place"""
 
-    sun_elevation: Number | None = None
+    sun_elevation: Annotated[Elevation | None, BeforeValidator(_degrees)] = None
     """optional: likewise, degrees above the horizon"""
 
     mask: FilePath = ""
     """optional: as `left_mask` of the scenes sheet; holds in every scene that names the image and
     no mask of its own"""
+
+    @model_validator(mode="after")
+    def _sun_is_whole(self) -> Image:
+        if (self.sun_azimuth is None) != (self.sun_elevation is None):
+            raise InputError(
+                f"image {self.image!r} has one angle of the sun, and not the other",
+                remedy="write both in degrees, or leave both empty",
+            )
+        return self
 
 
 def _rows(path: Path, sheet: type) -> list[tuple[int, dict[str, str]]]:
@@ -184,39 +216,12 @@ def read_cities(path: str | Path) -> dict[str, City]:
     rows = _rows(path, City)
     for number, cells in rows:
         with wrong.collect():
-            cities[cells["city"]] = _city(cells, number, path)
+            cities[cells["city"]] = check(cells, City, f"{path}, line {number}")
     for column in ("city", "prefix"):
         with wrong.collect():
             require_unique([cells[column] for _, cells in rows], column, path)
     wrong.refuse()
     return cities
-
-
-def _city(cells: Mapping[str, str], number: int, path: Path) -> City:
-    """A row of the cities sheet."""
-    values: dict[str, Any] = dict(cells)
-    for count in ("training", "validation", "testing"):
-        if not re.fullmatch(r"[0-9]{1,9}", cells[count]):
-            raise InputError(
-                f"line {number}: {count} is {cells[count]!r}",
-                file=path,
-                remedy=f"{count} is a number of tiles: a whole number, 0 or more",
-            )
-        values[count] = int(cells[count])
-    _epoch(cells["epoch"], "epoch", f"line {number}", path)
-    return check(values, City, f"{path}, line {number}")
-
-
-def _epoch(text: str, column: str, where: str, path: Path) -> None:
-    """Raise InputError if a cell is no epoch."""
-    try:
-        epoch_year(text)
-    except ValueError as error:
-        raise InputError(
-            f"{where}: {column} {text!r} {error}",
-            file=path,
-            remedy="write the decimal year of the coordinates, 2016.4, or a date, 2016-05-27",
-        ) from None
 
 
 def read_images(
@@ -230,7 +235,7 @@ def read_images(
     wrong = Mistakes()
     for number, cells in rows:
         with wrong.collect():
-            image = _image(cells, number, path)
+            image = check(cells, Image, f"{path}, line {number}")
             where = f"line {number}: image {image.image!r}"
             _known_city(image.city, where, cities, path, cities_sheet)
             before, other = first.setdefault(file_key(image.file), (number, image.image))
@@ -248,49 +253,6 @@ def read_images(
     return images
 
 
-def _image(cells: Mapping[str, str], number: int, path: Path) -> Image:
-    """A row of the images sheet."""
-    where = f"line {number}: image {cells['image']!r}"
-    values: dict[str, Any] = dict(cells)
-    values["sun_azimuth"], values["sun_elevation"] = _sun(cells, where, path)
-    image = check(values, Image, f"{path}, line {number}")
-    if image.acquired:
-        try:
-            acquisition_time(image.acquired)
-        except ValueError as error:
-            raise InputError(
-                f"{where}: acquired {image.acquired!r} {error}",
-                file=path,
-                remedy="write the date, 2020-10-25, or the time with its zone, "
-                "2020-10-25T03:12:45Z or 2020-10-25T11:12:45+08:00",
-            ) from None
-    return image
-
-
-def _sun(cells: Mapping[str, str], where: str, path: Path) -> tuple[float | None, float | None]:
-    """Azimuth and elevation in a row of the images sheet, degrees; None where they are empty."""
-    given = cells["sun_azimuth"], cells["sun_elevation"]
-    if given == ("", ""):
-        return None, None
-    remedy = "write both in degrees, or leave both empty"
-    try:
-        azimuth, elevation = map(float, given)
-    except ValueError:
-        raise InputError(
-            f"{where}: sun_azimuth {given[0]!r}, sun_elevation {given[1]!r} are not two numbers",
-            file=path,
-            remedy=remedy,
-        ) from None
-    if not (0 <= azimuth <= 360 and 0 < elevation <= 90):
-        raise InputError(
-            f"{where}: a sun of azimuth {azimuth:g} and elevation {elevation:g} degrees is not in "
-            "the sky",
-            file=path,
-            remedy="azimuth is 0 to 360, from north over east, elevation above 0 to 90",
-        )
-    return azimuth, elevation
-
-
 def file_key(file: str) -> str:
     """What two cells that name one file have in common."""
     return file if "://" in file else os.path.realpath(file)
@@ -302,11 +264,10 @@ def _known_city(
     """Raise InputError if the city of a row is none of the cities sheet."""
     if city in cities:
         return
-    close = difflib.get_close_matches(city, cities, n=1)
     raise InputError(
         f"{where} is of city {city!r}, which is not in {cities_sheet}",
         file=path,
-        remedy=f"did you mean {close[0]!r}?" if close else "add a row to the cities sheet",
+        remedy=did_you_mean(city, cities, "add a row to the cities sheet"),
     )
 
 
@@ -325,11 +286,10 @@ def with_images(
         image = images.get(cell) or by_file.get(file_key(cell))
         if image is None:
             if images and cell and not re.search(r"[./\\]", cell) and not Path(cell).is_file():
-                close = difflib.get_close_matches(cell, images, n=1)
                 raise InputError(
                     f"{where}: {view}_image {cell!r} is no image of the images sheet, and no file",
                     file=path,
-                    remedy=f"did you mean {close[0]!r}?" if close else "add its row to that sheet",
+                    remedy=did_you_mean(cell, images, "add its row to that sheet"),
                 )
             continue
         if image.city != cells["city"]:
@@ -375,7 +335,6 @@ def read_scenes(
             check(cells, Scene, f"{path}, line {number}")
             where = f"line {number}: scene {cells['scene']!r}"
             _known_city(cells["city"], where, cities, path, cities_sheet)
-            _epoch(cells["lidar_epoch"], "lidar_epoch", where, path)
             completed = with_images(cells, images or {}, where, path)
             scene = check(completed, Scene, f"{path}, line {number}")
             if file_key(scene.left_image) == file_key(scene.right_image):

@@ -1,4 +1,4 @@
-"""Tables of text that users write: sheets, control points, lists of tiles. The one reader of them.
+"""Tables of text that users write: sheets, control points, lists of tiles; their times and numbers.
 
 UTF-8 with or without a byte-order mark, any ends of lines, blanks around cells, blank lines. Lines
 that begin with ``#`` are remarks; ``# key: value`` among them declares something. The first other
@@ -63,7 +63,7 @@ def epoch_year(text: str) -> float | None:
 
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-LONGEST = 60  # characters; a float64 has 17 digits
+LONGEST_NUMBER = 60  # characters; a float64 has 17 digits
 
 
 def decimal_number(text: str) -> float:
@@ -71,7 +71,7 @@ def decimal_number(text: str) -> float:
 
     ``float`` takes more: ``1_000``, full-width digits, ``nan``. Raises ValueError.
     """
-    if len(text) > LONGEST or not _NUMBER.fullmatch(text):
+    if len(text) > LONGEST_NUMBER or not _NUMBER.fullmatch(text):
         raise ValueError(f"{text[:40]!r} is no number")
     return float(text)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import sys
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -49,6 +50,11 @@ AllowedHosts = Annotated[
     list[str] | None,
     typer.Option(help="Another host of which the catalogue may name tiles; may be given again."),
 ]
+
+
+def _print(lines: Iterable[str]) -> None:
+    for line in lines:
+        typer.echo(line)
 
 
 def _version(wanted: bool) -> None:
@@ -172,18 +178,19 @@ def scene_add(
     """Find images, RPCs and views in a delivery, look at the LiDAR, and write the scene's row."""
     from .add_scene import add_scene
 
-    for line in add_scene(
-        delivery,
-        lidar=lidar,
-        gcps=gcps,
-        city=city,
-        name=scene,
-        lidar_crs=lidar_crs,
-        geoid=geoid,
-        hosts=allow_host or (),
-        configfiles=configfile,
-    ):
-        typer.echo(line)
+    _print(
+        add_scene(
+            delivery,
+            lidar=lidar,
+            gcps=gcps,
+            city=city,
+            name=scene,
+            lidar_crs=lidar_crs,
+            geoid=geoid,
+            hosts=allow_host or (),
+            configfiles=configfile,
+        )
+    )
 
 
 @scene_app.command("list", epilog=examples("stereotruth scene list"))
@@ -191,8 +198,7 @@ def scene_list(configfile: Configured = None) -> None:
     """The scenes of the project: city, images and LiDAR of each."""
     from .add_scene import list_scenes
 
-    for line in list_scenes(configfile):
-        typer.echo(line)
+    _print(list_scenes(configfile))
 
 
 @scene_app.command("remove", epilog=examples("stereotruth scene remove Marseille-1"))
@@ -237,10 +243,11 @@ def gcps_import(
     """Bring control points of QGIS, Ames Stereo Pipeline or a CSV into the project's form."""
     from .import_gcps import import_gcps
 
-    for line in import_gcps(
-        files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right, epoch=epoch
-    ):
-        typer.echo(line)
+    _print(
+        import_gcps(
+            files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right, epoch=epoch
+        )
+    )
 
 
 @app.command(
@@ -268,16 +275,17 @@ def lidar_tiles(
     """List the tiles of a catalogue that lie on the ground of scenes; rows then name the list."""
     from .list_tiles import list_of_scenes
 
-    for line in list_of_scenes(
-        catalogue,
-        to,
-        scenes or [],
-        hosts=allow_host or (),
-        column=column,
-        dates=dates if all(dates) else None,
-        configfiles=configfile,
-    ):
-        typer.echo(line)
+    _print(
+        list_of_scenes(
+            catalogue,
+            to,
+            scenes or [],
+            hosts=allow_host or (),
+            column=column,
+            dates=dates if all(dates) else None,
+            configfiles=configfile,
+        )
+    )
 
 
 @app.command(
@@ -340,8 +348,7 @@ def pairs(
     given = {"lidar": lidar, "gcps": gcps, "lidar_crs": lidar_crs, "geoid": geoid}
     listing = list_pairs(city, choice, given, configfile)
     show_pairs(listing.rated, listing.chosen)
-    for line in listing.lines:
-        typer.echo(line)
+    _print(listing.lines)
 
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -378,8 +385,7 @@ def targets(configfile: Configured = None) -> None:
     """List what a run can make, one line each, and the names to put in."""
     from .run_workflow import list_targets
 
-    for line in list_targets(configfile):
-        typer.echo(line)
+    _print(list_targets(configfile))
 
 
 @app.command(
@@ -398,8 +404,7 @@ def profile(
     """List the profiles of the package, or copy one here, to set account and partition in it."""
     from .new_project import copy_profile, list_profiles
 
-    for line in [copy_profile(name, folder)] if name else list_profiles():
-        typer.echo(line)
+    _print([copy_profile(name, folder)] if name else list_profiles())
 
 
 @app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))

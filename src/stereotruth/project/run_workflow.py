@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import sys
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.config.methods import DATASETS
-from ..core.errors import InputError
+from ..core.errors import InputError, did_you_mean
 from .project import (
     CONFIG,
     FILES,
@@ -131,8 +130,7 @@ def refuse_unknown(given: Sequence[str], configfiles: Sequence[Path] | None = No
     for word in words_before_options(given):
         names = _names_for(word, configfiles)
         if names and word not in names:
-            close = difflib.get_close_matches(word, names, n=1)
-            remedy = f"did you mean {close[0]}?" if close else "stereotruth targets lists them"
+            remedy = did_you_mean(word, names, "stereotruth targets lists them")
             raise InputError(f"{word}: no such target", remedy=remedy)
 
 

@@ -56,7 +56,7 @@ def test_a_typo_is_told_with_what_it_may_mean(folder):
         ("results/report/Goood/index.html", "results/report/Good/index.html"),
         ("benchmark/syntetic/sgm", "benchmark/synthetic/sgm"),
     ):
-        with pytest.raises(InputError, match=f"did you mean {meant}"):
+        with pytest.raises(InputError, match=f"did you mean '{meant}'"):
             refuse_unknown([word, "--cores", "2"])
     refuse_unknown(["report", "tiles/Good", "results/x.json", "--forcerun", "anything"])
     refuse_unknown(["results/closure/Good.json", "results/training_cities/cities/1"])

@@ -1,4 +1,4 @@
-"""The whole configuration: what users write, checked."""
+"""The whole configuration, checked: sections of the stages that make labels, and all of them."""
 
 from __future__ import annotations
 

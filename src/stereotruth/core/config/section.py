@@ -6,7 +6,6 @@ its limits, and the nearest name of an unknown key.
 
 from __future__ import annotations
 
-import difflib
 import re
 import types
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,7 @@ from pydantic import (
     ValidationError,
 )
 
-from ..errors import InputError
+from ..errors import InputError, did_you_mean
 from ..products.files import LONGEST_NAME
 
 Values = TypeVar("Values", bound=tuple)
@@ -253,8 +252,7 @@ def complaint(error: ValidationError, of: Any) -> tuple[str, str]:
         surplus = sorted(str(e["loc"][-1]) for e in unknown if e["loc"][:-1] == first)
         place = _located(of, first)
         known = sorted(fields_of(place.inside))
-        close = difflib.get_close_matches(surplus[0], known, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known keys: {', '.join(known)}"
+        hint = did_you_mean(surplus[0], known, f"known keys: {', '.join(known)}")
         under = f" under {'.'.join(place.names)!r}" if place.names else ""
         return f"unknown key {', '.join(map(repr, surplus))}{under}", hint
     of_first = [e for e in every if e["loc"][:1] == every[0]["loc"][:1]]

@@ -1,1 +1,1 @@
-"""Interpolation, robust least squares, error sums, summed areas: each once, of arrays alone."""
+"""Interpolation, robust fits, error sums, windows, geometry: each once, of arrays alone."""

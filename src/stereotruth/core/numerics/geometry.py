@@ -1,4 +1,4 @@
-"""."""
+"""Degrees of longitude and latitude in metres, the convex hull, and triangles over an image."""
 
 from __future__ import annotations
 

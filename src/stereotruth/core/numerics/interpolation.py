@@ -1,4 +1,8 @@
-"""."""
+"""Interpolation on a grid: bilinear, cubic convolution, and uniform cubic B-splines.
+
+Cubic convolution (Keys 1981, IEEE TASSP 29): with four samples (section IV, a = -1/2) quadratic
+polynomials come out exactly, with six (section VI) cubic ones.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""."""
+"""Robust scale, weights and least squares; and error statistics that add up block by block."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""."""
+"""Sums and greatest values over squares of a grid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Files and folders that are whole or absent, and tables in CSV."""
+"""Files and folders that are whole or absent, CSV and JSON, and names that others state.
+
+Manifests, results and submissions of others say what products are called. Such a name must be a
+plain one: part of one file name, and nothing that leads elsewhere.
+"""
 
 from __future__ import annotations
 

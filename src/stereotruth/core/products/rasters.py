@@ -1,4 +1,4 @@
-"""TIFF and PNG files of one band or three: read and written in one place, not georeferenced."""
+"""The one reader of rasters: images, labels, heights, undulations, masks; and TIFFs written."""
 
 from __future__ import annotations
 
@@ -125,9 +125,12 @@ class Hidden:
 
 
 class Values:
-    """The values of an open raster. ``unit``: of what the band counts in, in m or px.
+    """The values of an open raster: its one band of real numbers, by scale and offset.
 
-    Raises InputError: see :func:`refuse_bands`; and, as it is read, the range rule's.
+    There is none where the file's mask or alpha band hides it, where it is the declared nodata
+    value, or where it is not finite. ``unit``: of what the band counts in, in m or px. Raises
+    InputError: see :func:`refuse_bands`; and, as it is read, for a value that its quantity cannot
+    have.
     """
 
     def __init__(self, dataset: Any, file: Path, quantity: Quantity, unit: float = 1.0) -> None:
@@ -198,9 +201,15 @@ class _Value:
 
 
 class Fills:
-    """The rim rule, of windows that are added one after the other.
+    """The rim rule, which finds fill values that nobody has declared; windows are added one by one.
 
-    ``may_be_constant``: one value everywhere is no fill, as of a grid that somebody has made of 0.
+    A value that producers fill with (:data:`FILLS`, before scale and offset; or the lowest or
+    highest of all, farther from the next than the others reach and than :data:`FAR`) is a fill if
+    it is the only one, or occurs :data:`OFTEN` times as often as any other within 1 of it and its
+    neighbours differ from it by more than 1 and by more than nine tenths of all other neighbours do
+    from each other. A mask or alpha band that shows such values ends the rule: it says what is
+    there. False alarms: docs/damaged_input.md. ``may_be_constant``: one value everywhere is no
+    fill, as of a grid that somebody has made of 0.
     """
 
     def __init__(self, values: Values, *, may_be_constant: bool = False) -> None:

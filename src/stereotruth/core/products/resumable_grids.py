@@ -5,7 +5,7 @@ any rule, so that it outlives jobs, killed or not:
 
 ===================  ==============================================================================
 ``store/``           the arrays, without attributes of the scene
-``done/``            record of each block, one shard of each array; see :mod:`.resumable_grids`
+``done/``            record of each block, one shard of each array; see :class:`Ledger`
 ``layout.json``      shape, arrays and chunks
 ``lock``             held by the job at work here, shared by the parts of one scene
 ===================  ==============================================================================
