@@ -40,7 +40,6 @@ gcps_app = typer.Typer(no_args_is_help=True, help="Ground control points.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(gcps_app, name="gcps")
 
-Text = Annotated[str, typer.Option()]
 Configured = Annotated[
     list[Path] | None,
     typer.Option("--configfile", help="Read this instead of config.yaml; may be given again."),

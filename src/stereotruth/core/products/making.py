@@ -3,8 +3,8 @@
 Checksums of large inputs are kept with a stamp: what the file system says of a file, or of all
 files in a folder. Where two stamps are equal nothing was written in between, but for a file written
 within the coarsest tick of a file system's clock (two seconds) before: of such ones no checksum is
-kept. Locks are `flock` on files: the kernel drops them when a process ends, however it ends. On file
-systems without locks work goes on with a warning.
+kept. Locks are `flock` on files: the kernel drops them when a process ends, however it ends. On
+file systems without locks work goes on with a warning.
 """
 
 from __future__ import annotations
