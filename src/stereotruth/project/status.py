@@ -23,8 +23,8 @@ from .run_workflow import arguments_for
 
 FOLLOWS = "Input files updated by another job"  # of a job that runs because another does
 LONGEST = 300  # characters of a reason
-# How Snakemake says that params differ, and what stands in these; ``code``, ``script`` and
-# ``sources`` are digests (workflow/rules/sources.smk).
+# How Snakemake says that params differ, and what stands in these; ``code``, and what stands in
+# ``sources``, are digests (workflow/rules/sources.smk).
 PARAMS = re.compile(r"Params have changed .*?before: (.*) now: (.*)")
 DIGEST = re.compile(r"'[0-9a-f]{12,16}'")
 
