@@ -1,0 +1,27 @@
+"""The surface of the points, made once for all pairs that take the same LiDAR."""
+
+
+rule surface:
+    input:
+        images=images_of_surface,
+        beside=beside_images_of_surface,
+        points=point_stores,
+    output:
+        surface=directory("results/surface/{city}/{scene}.surface"),
+    log:
+        "logs/surface/{city}/{scene}.log",
+    benchmark:
+        "logs/surface/{city}/{scene}.tsv"
+    conda:
+        CONDA
+    threads: 2
+    resources:
+        mem_mb=4000,
+        runtime=240,
+    params:
+        sources=upstream("surface"),
+        code=source_digest("stereotruth.surface.make_surface", "stereotruth.sensor.shown_ground"),
+    message:
+        "Making the surface of the points of scene {wildcards.scene}"
+    script:
+        "../scripts/surface.py"
