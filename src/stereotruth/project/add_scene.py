@@ -78,7 +78,7 @@ def find_pair(given: Sequence[Path]) -> tuple[tuple[Image, Image], list[str]]:
             file=given[0],
             remedy="name the delivery's folder (or both folders), or the left and right image",
         )
-    images = [_open(file) for file in files]
+    images = [Image(f, _view(f), *open_view(_view(f) or "first", f, "")) for f in files]
     if {image.view for image in images} == {"left", "right"}:
         images.sort(key=lambda image: image.view)
     elif files == given:  # named one by one: left, right
@@ -88,11 +88,6 @@ def find_pair(given: Sequence[Path]) -> tuple[tuple[Image, Image], list[str]]:
         told = "its own metadata" if source == image.path else source.name
         lines.append(f"{image.path.name}: {image.size[0]} x {image.size[1]} px, RPC from {told}")
     return (images[0], images[1]), lines
-
-
-def _open(file: Path) -> Image:
-    sensor, size = open_view(_view(file) or "first", file, "")
-    return Image(file, _view(file), sensor, size)
 
 
 def _in_folders(folders: Sequence[Path]) -> tuple[list[Path], list[str]]:
@@ -175,7 +170,9 @@ def add_scene(
     cities, scenes, _ = read_rows(settings)
     pair, lines = find_pair(delivery)
     _refuse_repeated(pair, scenes, rows)
-    city = city or _word(_folder_name(delivery))
+    first = delivery[0].absolute()
+    folder = first if first.is_dir() else first.parent
+    city = city or re.sub(r"[^A-Za-z0-9-]+", "-", folder.name).strip("-") or "City"
     name = name or _unused(city, scenes)
     if name in scenes:
         raise InputError(
@@ -293,15 +290,6 @@ def in_order(
     return (one, other), model, [f"left: {one.path}", f"right: {other.path}", words]
 
 
-def _folder_name(delivery: Sequence[Path]) -> str:
-    first = delivery[0].absolute()
-    return (first if first.is_dir() else first.parent).name
-
-
-def _word(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9-]+", "-", text).strip("-") or "City"
-
-
 def _unused(city: str, scenes: dict[str, sheets.Scene]) -> str:
     """The first of City-1, City-2 … that no scene has."""
     base = re.sub(r"[^A-Za-z0-9-]", "-", city)
@@ -348,10 +336,15 @@ def remove_scene(name: str, configfiles: Sequence[Path] | None = None) -> str:
     lines = file.read_text(encoding="utf-8-sig").splitlines(keepends=True)
     begin = next(k for k, line in enumerate(lines) if line.strip() and not line.startswith("#"))
     column = [cell.strip() for cell in lines[begin].split("\t")].index("scene")
+
+    def cell_of(line: str) -> str:
+        cells = line.rstrip("\r\n").split("\t")
+        return cells[column].strip() if column < len(cells) else ""
+
     kept = [
         line
         for k, line in enumerate(lines)
-        if k <= begin or line.startswith("#") or _cell(line, column) != name
+        if k <= begin or line.startswith("#") or cell_of(line) != name
     ]
     if len(kept) == len(lines):
         raise InputError(
@@ -360,8 +353,3 @@ def remove_scene(name: str, configfiles: Sequence[Path] | None = None) -> str:
     with atomic_file(file) as scratch:
         scratch.write_text("".join(kept), encoding="utf-8")
     return f"{file}: scene {name} taken out; what was made of it stays under results/ and tiles/"
-
-
-def _cell(line: str, column: int) -> str:
-    cells = line.rstrip("\r\n").split("\t")
-    return cells[column].strip() if column < len(cells) else ""

@@ -8,7 +8,7 @@ from time import monotonic
 
 from stereocities.cities import city_of, file_of
 
-from ..core.errors import InputError
+from ..core.errors import InputError, in_number
 from ..core.sheets import Scene
 from ..lidar.frames import Epoch
 from ..tiles.windows import cell_step
@@ -84,7 +84,9 @@ def check_project(
                 "no scene in it", file=rows, remedy="stereotruth scene add DELIVERY --lidar FOLDER"
             )
         scenes = found
-        project.say("sheets", Level.FACT, _counted(scenes))
+        towns = len({scene.city for scene in scenes.values()})
+        count = f"{in_number(len(scenes), 'scene')} of {towns} {'city' if towns == 1 else 'cities'}"
+        project.say("sheets", Level.FACT, count)
     if scenes is None:
         return [project]
     in_sheet = {name: names_in_pair(scene, images) for name, scene in every_scene.items()}
@@ -95,7 +97,13 @@ def check_project(
     began = monotonic()
     for k, (name, scene) in enumerate(scenes.items()):
         if k == TIMED:
-            _tell_time(tell, (monotonic() - began) / TIMED, len(scenes) - TIMED)
+            left = len(scenes) - TIMED
+            left_s = (monotonic() - began) / TIMED * left
+            if left_s > MOMENT_S:
+                tell(
+                    f"looking at {left} more scenes, about {duration(left_s)}; "
+                    "stereotruth check SCENE … looks at some"
+                )
         found = Findings(name)
         if is_synthetic(scene):
             _check_synthetic(scene, found)
@@ -121,15 +129,6 @@ def check_project(
     return [*every, run]
 
 
-def _tell_time(tell: Callable[[str], object], scene_s: float, left: int) -> None:
-    """Say how long the scenes that are left take by those before, if it is more than a moment."""
-    if scene_s * left > MOMENT_S:
-        tell(
-            f"looking at {left} more scenes, about {duration(scene_s * left)}; "
-            "stereotruth check SCENE … looks at some"
-        )
-
-
 def _check_synthetic(scene: Scene, found: Findings) -> None:
     """What a run makes needs nothing but the files of the place that a city is the twin of."""
     with found.of("input"):
@@ -146,11 +145,3 @@ def _check_synthetic(scene: Scene, found: Findings) -> None:
                     remedy=f"put it back, or correct its path in {file_of(city.name)}",
                 )
         found.say("input", Level.FACT, f"twin of {city.twin.file}: {words}")
-
-
-def _counted(scenes: dict[str, Scene]) -> str:
-    cities = len({scene.city for scene in scenes.values()})
-    return (
-        f"{len(scenes)} scene{'s' * (len(scenes) != 1)} of {cities} "
-        f"{'city' if cities == 1 else 'cities'}"
-    )

@@ -18,7 +18,7 @@ from ..core.products.remote_files import bring_image, is_remote, state_of
 from ..lidar.catalogue import Cover, Tile, cover_of, read_catalogue, resolved
 from ..lidar.catalogue_list import SUFFIX, ListedTile, TileList, write_list
 from ..lidar.declared_crs import LidarCRS, interpret
-from ..lidar.footprint import CELL_DEG, Footprint
+from ..lidar.footprint import CELL_DEG
 from .check import chosen
 from .project import configured, read_rows, sheet
 
@@ -95,9 +95,10 @@ def list_tiles(
     cover = cover_of(read.tiles, footprint)
     taken = [read.tiles[k] for k in cover.taken]
     if not taken:
+        row, first, _ = footprint.runs[0]
         raise InputError(
             f"none of its {in_number(len(read.tiles), 'tile')} lies on the ground of the images, "
-            f"{_place(footprint)}",
+            f"about {first * CELL_DEG:.4f}, {row * CELL_DEG:.4f} (longitude, latitude)",
             file=catalogue,
             remedy="take the catalogue of that region, and check its coordinate system",
         )
@@ -179,22 +180,12 @@ def _system_of(tiles: Sequence[Tile], catalogue: str) -> str:
     return crs.to_wkt() if code is None else f"EPSG:{code}"
 
 
-def _named(crs: str) -> str:
-    """A system as a line has it."""
-    return crs if crs.startswith("EPSG:") else CRS.from_user_input(crs).name
-
-
 def _heights(system: LidarCRS | None) -> str:
     """What heights count from, and their unit."""
     if system is None or not system.has_vertical:
         return "not declared"
     kind = "ellipsoid" if system.ellipsoidal else str(system.vertical_datum)
     return f"{kind}, {system.vertical_unit or 'metre'}"
-
-
-def _place(footprint: Footprint) -> str:
-    row, first, _ = footprint.runs[0]
-    return f"about {first * CELL_DEG:.4f}, {row * CELL_DEG:.4f} (longitude, latitude)"
 
 
 def _lines(listed: TileList, every: int, places: Sequence[str], cover: Cover) -> list[str]:
@@ -211,7 +202,8 @@ def _lines(listed: TileList, every: int, places: Sequence[str], cover: Cover) ->
         "lies on that ground",
     ]
     if listed.crs:
-        named = _named(listed.crs)
+        crs = listed.crs
+        named = crs if crs.startswith("EPSG:") else CRS.from_user_input(crs).name
         lines.append(f"coordinates by the catalogue, where files and lidar_crs say none: {named}")
     if listed.hole_m2 and cover.hole_at:
         at = ", ".join(f"{value:.4f}" for value in cover.hole_at)

@@ -101,7 +101,8 @@ class _Selection:
         )
         pair = self.remaining.pop(best).pair
         for names, other in self.remaining.items():
-            self.alike[names] += _alike(pair, other.pair)
+            bases = sorted((pair.base, other.pair.base))
+            self.alike[names] += bases[1] <= ALIKE_BASES * bases[0]
         self.used.update(best)
         self.chosen.append(best)
         return True
@@ -132,11 +133,6 @@ def _growing(pairs: Sequence[RatedPair], each: int | None, most: int) -> _Select
     while len(selection.chosen) < most and (selection.choose(links) or selection.choose(apart)):
         pass
     return selection
-
-
-def _alike(one: SitePair, other: SitePair) -> bool:
-    """Whether two pairs tell much the same of heights: by bases over height."""
-    return max(one.base, other.base) <= ALIKE_BASES * min(one.base, other.base)
 
 
 def roughness_of(city: str, settings: Configuration) -> float | None:

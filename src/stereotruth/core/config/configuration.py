@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from ..errors import InputError
 from .methods import DATASETS, Audit, Benchmark, Predict, Training
 from .section import (
     FilePath,
@@ -273,18 +272,6 @@ class Report(Section):
 Strips = Annotated[Whole, Field(ge=1, le=1000)]
 
 
-REPLACED = {
-    "occlusion.method": "project.recipe: surface takes the place of both, paper that of "
-    "correlation; there is nothing in place of geometric and none",
-    "occlusion.window": "it is project.window now",
-    "occlusion.correlation_threshold": "it is project.correlation_threshold now",
-    "project.representative": "project.recipe: surface takes the place of top, paper that of paper",
-    "project.fill": "project.recipe: surface labels pixels between points; there is nothing in "
-    "place of none (drop the status labelled_between) and of surface_and_images",
-}
-"""Keys of earlier versions, and what takes their place."""
-
-
 class Dask(Section):
     """The configuration's section dask."""
 
@@ -342,7 +329,6 @@ class Configuration(Section):
     @classmethod
     def of(cls, config: Mapping[str, Any], file: str | Path = "config") -> Configuration:
         """What the user wrote. Raises InputError that names ``file`` and the first wrong key."""
-        _refuse_replaced(config, file)
         return check(_without_unnamed(config), cls, file)
 
 
@@ -354,12 +340,3 @@ def _without_unnamed(config: Mapping[str, Any]) -> Mapping[str, Any]:
         return config
     unnamed = dict.fromkeys(DATASETS)
     return {**config, "benchmark": {**benchmark, "datasets": {**unnamed, **datasets}}}
-
-
-def _refuse_replaced(config: Mapping[str, Any], file: str | Path) -> None:
-    """Raise InputError that names the first key of REPLACED which is given."""
-    for name, remedy in REPLACED.items():
-        section, key = name.split(".")
-        given = config.get(section)
-        if isinstance(given, Mapping) and key in given:
-            raise InputError(f"{name}: there is no such key any more", file=file, remedy=remedy)

@@ -50,17 +50,15 @@ def _files(path: Path) -> Iterator[tuple[str, Path]]:
             yield str(file.relative_to(path)), file
 
 
-def _fresh(file: Path) -> os.stat_result:
-    """The state of a file that is opened for it: a network file system then asks its server."""
-    with file.open("rb") as stream:
-        return os.fstat(stream.fileno())
-
-
 def stamp(path: str | Path) -> tuple[str, bool]:
     """Digest of what the file system says of a file or folder; whether it was written just now."""
     found, newest = hashlib.sha256(), 0
     for name, file in _files(Path(path)):
-        state = file.stat() if name else _fresh(file)
+        if name:
+            state = file.stat()
+        else:
+            with file.open("rb") as stream:  # a network file system then asks its server
+                state = os.fstat(stream.fileno())
         times = state.st_mtime_ns, state.st_ctime_ns
         # no number of the device: other machines have others for the same file
         found.update(json.dumps([name, state.st_size, state.st_ino, *times]).encode())
@@ -240,7 +238,9 @@ def making(inputs: Iterable[str | Path], outputs: Sequence[str | Path]) -> Itera
             refuse_replaced(_inputs)
             for path in inputs:
                 remote_files.refuse_changed(path)
-            _note(outputs)
+            names = [str(path) for path in outputs]  # one file a job: several nodes may write
+            with suppress(FileNotFoundError):  # no run of the workflow
+                (MADE / digest(names)).write_text(json.dumps(names))
         except (InputError, OSError):
             raise
         except Exception as error:
@@ -269,13 +269,6 @@ def begin_notes() -> None:
 def noted() -> list[str]:
     """Files and folders that the jobs of the newest run have made."""
     return [path for file in sorted(MADE.glob("*")) for path in json.loads(file.read_text())]
-
-
-def _note(outputs: Sequence[str | Path]) -> None:
-    """One file for each job: several nodes may write at once."""
-    names = [str(path) for path in outputs]
-    with suppress(FileNotFoundError):  # no run of the workflow
-        (MADE / digest(names)).write_text(json.dumps(names))
 
 
 def marks_of_inputs() -> Marks:

@@ -116,17 +116,17 @@ class BlockStore:
                 files += [file] if name in sums else []
         layout = json.loads((self.folder / "layout.json").read_text())
         with atomic_store(path) as unfinished:
-            metadata = _only_metadata(self)
-            shutil.copytree(self.store, unfinished, ignore=metadata, dirs_exist_ok=True)
+            grids = {str(self.store / name) for name in self.layers}
+            shutil.copytree(
+                self.store,
+                unfinished,
+                ignore=lambda folder, names: ["c"] if folder in grids else [],
+                dirs_exist_ok=True,
+            )
             for file in files:
                 link(file, unfinished / file.relative_to(self.store))
             group = zarr.open_group(unfinished, mode="r+")
             group.attrs.update({**attrs, "content": digest({"layout": layout, "blocks": content})})
-
-
-def _only_metadata(store: BlockStore) -> Any:
-    grids = {str(store.store / name) for name in store.layers}
-    return lambda folder, names: ["c"] if folder in grids else []
 
 
 @contextmanager

@@ -9,17 +9,8 @@ import pytest
 
 from stereobench.methods import kinds
 from stereotruth.core.config import configuration, methods
-from stereotruth.core.config.configuration import REPLACED, Configuration
+from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.errors import InputError
-
-
-def test_a_key_of_earlier_versions_is_refused_with_what_takes_its_place():
-    for path, remedy in REPLACED.items():
-        with pytest.raises(InputError) as refusal:
-            Configuration.of(with_key(path, 1), "mine.yaml")
-        assert f"mine.yaml: {path}" in str(refusal.value) and refusal.value.remedy == remedy
-        section, key = path.split(".")
-        assert not hasattr(getattr(Configuration(), section, None), key), "replaced and known"
 
 
 def test_entries_by_name_lie_over_those_that_are_not_written():
