@@ -367,9 +367,7 @@ PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_opt
         "stereotruth run benchmark/synthetic/sgm -- --keep-going",
     ),
 )
-def run(
-    context: typer.Context,
-) -> None:
+def run(context: typer.Context) -> None:
     """Run the workflow; see ``help`` above."""
     from .run_workflow import run_workflow
 
@@ -442,10 +440,7 @@ def score_surface_model(
     reference_classes: Annotated[
         Path | None, typer.Option(help="LAS classes on the grid of the reference raster.")
     ] = None,
-    epoch: Annotated[
-        str,
-        typer.Option(help="Epoch of the model's images, 2016.4 or a date."),
-    ] = "",
+    epoch: Annotated[str, typer.Option(help="Of the model's images, 2016.4 or a date.")] = "",
 ) -> None:
     """Judge any surface model: where it lies, its heights by surface and slope, edges of roofs."""
     from .score_dsm import score_dsm
@@ -470,7 +465,7 @@ def open_pages(
     words: Annotated[
         list[str] | None, typer.Argument(help="Only pages with one of these in their path.")
     ] = None,
-    listed: Annotated[bool, typer.Option("--list", help="Print their paths, open none.")] = False,
+    listed: Annotated[bool, typer.Option("--list", help="Print their paths only.")] = False,
 ) -> None:
     """Open the index of all pages (cities, benchmarks, audits), or those that are named."""
     from ..evaluate.report.index_page import pages_with
@@ -491,11 +486,9 @@ def main() -> None:
     compiling.addHandler(terminal := logging.StreamHandler(sys.stderr))
     try:
         app()
-    except InputError as error:
-        sys.stderr.write(f"error: {error}\n")
-        raise SystemExit(1) from None
-    except OSError as error:
-        if (told := told_by_system(error)) is None:
+    except (InputError, OSError) as error:
+        told = error if isinstance(error, InputError) else told_by_system(error)
+        if told is None:
             raise
         sys.stderr.write(f"error: {told}\n")
         raise SystemExit(1) from None
