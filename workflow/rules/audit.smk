@@ -7,8 +7,6 @@ rule audit:
         "logs/audit/{dataset}.log",
     benchmark:
         "logs/audit/{dataset}.tsv"
-    wildcard_constraints:
-        dataset="[^/]+",
     conda:
         CONDA
     threads: 2

@@ -8,9 +8,6 @@ rule match:
         "logs/match/{dataset}/{method}.log",
     benchmark:
         "logs/match/{dataset}/{method}.tsv"
-    wildcard_constraints:
-        dataset="[^/]+",
-        method="[^/]+",
     conda:
         CONDA
     threads: 2
@@ -41,7 +38,6 @@ rule score:
     benchmark:
         "logs/score/{dataset}/{method}.tsv"
     wildcard_constraints:
-        dataset="[^/]+",
         method="[^/.]+",  # not a table of all methods
     conda:
         CONDA
@@ -77,7 +73,6 @@ rule submission:
     benchmark:
         "logs/submission/{dataset}/{method}.tsv"
     wildcard_constraints:
-        dataset="[^/]+",
         method="[^/.]+",
     conda:
         CONDA
@@ -128,8 +123,6 @@ rule benchmark_tables:
         "logs/benchmark_tables/{dataset}.log",
     benchmark:
         "logs/benchmark_tables/{dataset}.tsv"
-    wildcard_constraints:
-        dataset="[^/]+",
     conda:
         CONDA
     resources:

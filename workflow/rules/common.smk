@@ -57,6 +57,13 @@ wildcard_constraints:
     side="|_right",
     strip="[0-9]+-of-[0-9]+",
     lidar="[^/]+",
+    tile=r"[^/]+\.la[sz]",
+    origin="|".join(SCENES),
+    image="[A-Za-z0-9_-]+",
+    number="[0-9]+",
+    tiles="[1-9][0-9]*",
+    dataset="[^/]+",
+    method="[^/]+",
 
 
 def no_scenes(sheet, what, remedy):

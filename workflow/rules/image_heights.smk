@@ -12,8 +12,6 @@ rule image_heights:
         "logs/image_heights/{city}/{image}.log",
     benchmark:
         "logs/image_heights/{city}/{image}.tsv"
-    wildcard_constraints:
-        image="[A-Za-z0-9_-]+",
     conda:
         CONDA
     threads: 2

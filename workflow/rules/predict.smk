@@ -9,8 +9,6 @@ rule predict_scene:
         "logs/predict_scene/{city}/{scene}/{method}.log",
     benchmark:
         "logs/predict_scene/{city}/{scene}/{method}.tsv"
-    wildcard_constraints:
-        method="[^/]+",
     conda:
         CONDA
     threads: 2
@@ -40,8 +38,6 @@ rule dsm:
         "logs/dsm/{city}/{scene}/{method}.log",
     benchmark:
         "logs/dsm/{city}/{scene}/{method}.tsv"
-    wildcard_constraints:
-        method="[^/]+",
     conda:
         CONDA
     threads: 2
@@ -69,8 +65,6 @@ rule score_dsm:
         "logs/score_dsm/{city}/{scene}/{method}.log",
     benchmark:
         "logs/score_dsm/{city}/{scene}/{method}.tsv"
-    wildcard_constraints:
-        method="[^/]+",
     conda:
         CONDA
     resources:

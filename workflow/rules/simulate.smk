@@ -58,8 +58,6 @@ rule simulate_lidar:
         "logs/simulate_lidar/{city}/{scene}/{tile}.log",
     benchmark:
         "logs/simulate_lidar/{city}/{scene}/{tile}.tsv"
-    wildcard_constraints:
-        tile=r"[^/]+\.la[sz]",
     conda:
         CONDA
     resources:

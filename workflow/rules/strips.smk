@@ -35,8 +35,6 @@ rule move_strips:
         "logs/move_strips/{city}/{scene}/{origin}/{lidar}.log",
     benchmark:
         "logs/move_strips/{city}/{scene}/{origin}/{lidar}.tsv"
-    wildcard_constraints:
-        origin="|".join(SCENES),
     conda:
         CONDA
     resources:

@@ -16,9 +16,6 @@ rule train:
         "logs/train/{dataset}/{method}.log",
     benchmark:
         "logs/train/{dataset}/{method}.tsv"
-    wildcard_constraints:
-        dataset="[^/]+",
-        method="[^/]+",
     conda:
         CONDA
     threads: 2

@@ -10,8 +10,6 @@ rule training_city:
         "logs/training_city/{number}.log",
     benchmark:
         "logs/training_city/{number}.tsv"
-    wildcard_constraints:
-        number="[0-9]+",
     conda:
         CONDA
     resources:
@@ -40,8 +38,6 @@ rule training_cities:
         "logs/training_cities/{tiles}.log",
     benchmark:
         "logs/training_cities/{tiles}.tsv"
-    wildcard_constraints:
-        tiles="[1-9][0-9]*",
     conda:
         CONDA
     resources:

@@ -315,16 +315,6 @@ def test_a_tile_that_its_server_redirects_or_refuses_is_not_listed(folder, monke
         assert other.asked == []
 
 
-@pytest.mark.parametrize("status", [403, 500, 503])
-def test_a_tile_that_a_server_refuses_is_not_taken_for_a_missing_one(folder, monkeypatch, status):
-    monkeypatch.setattr(remote_files, "WAIT_S", 0.01)
-    with serving() as site:
-        url = with_catalogue(site, folder)
-        site.answers["/lidar/t0.laz"] = (status, {}, b"")
-        with pytest.raises(InputError, match=f"it answers {status}"):
-            listed(url)
-
-
 def test_no_file_and_no_line_has_a_signature(folder, caplog, capsys):
     """Of a catalogue's URL, or of what servers redirect to: lists, stand-ins, stores, messages."""
     caplog.set_level("DEBUG")
