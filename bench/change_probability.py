@@ -37,7 +37,6 @@ from planted_changes import GROUND, KINDS, ROOF, Planted, RealScene
 from real import Pair, Site
 
 from stereocities.changes import REASONS, TEXTURE
-from stereotruth.core.numerics.decision_trees import LEAF, DecisionTrees
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.status import is_labelled
 from stereotruth.epipolar.image_noise import EQUAL
@@ -52,6 +51,7 @@ from stereotruth.labels.change_probability import (
     with_surroundings,
 )
 from stereotruth.labels.crowns import with_crowns
+from stereotruth.labels.decision_trees import LEAF, DecisionTrees
 from stereotruth.labels.image_agreement import least_probability
 from stereotruth.labels.learned_evidence import LEARNED, learned
 from stereotruth.labels.recipe import lidar_labels

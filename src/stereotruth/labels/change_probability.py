@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.decision_trees import DecisionTrees
 from ..epipolar.surface_windows import alike_mean, surface_mean
 from ..epipolar.window_sums import wanted_runs
 from .change_evidence import LabelledWindow, change_evidence
+from .decision_trees import DecisionTrees
 from .learned_evidence import beyond_learned
 
 Floats = NDArray[np.float64]

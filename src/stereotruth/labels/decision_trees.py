@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..core.kernels import kernel
 
 Singles = NDArray[np.float32]
 Steps = NDArray[np.int32]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.core.numerics.decision_trees import COLUMNS, DecisionTrees
+from stereotruth.labels.decision_trees import COLUMNS, DecisionTrees
 
 TWO_TREES = """\
 0	0	-1	0	0	0	0.5
