@@ -48,7 +48,7 @@ rule move_strips:
     params:
         sources=upstream("move_strips"),
         script=content_of("../scripts/move_strips.py"),
-        code=source_digest("stereotruth.lidar.strip_moves"),
+        code=source_digest("stereotruth.lidar.strips"),
     message:
         "Moving the points of {wildcards.lidar} by the offsets of their strips"
     script:

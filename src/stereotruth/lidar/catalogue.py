@@ -33,7 +33,7 @@ from ..core.products.remote_files import SCHEMES, is_remote, read_bytes
 from ..core.sheets import LIDAR_SEPARATOR, LIDAR_SUFFIXES, RASTER_SUFFIXES
 from .catalogue_list import EPT
 from .declared_crs import interpret
-from .footprint import CELL_DEG, Footprint
+from .lattice import CELL_DEG, Footprint
 
 MOST_BYTES = 200_000_000  # of a catalogue
 MOST_TILES = 1_000_000

@@ -24,7 +24,7 @@ from ..core.errors import InputError
 from ..core.products.files import atomic_file
 from ..core.products.remote_files import is_remote, place_of, stand_in_of
 from ..core.tables import Table
-from .footprint import Footprint
+from .lattice import Footprint
 
 SUFFIX = ".tsv"
 EPT = "ept.json"  # a file of points by its name, no catalogue
@@ -55,7 +55,7 @@ class TileList:
 
     ``catalogue``: path or URL, without secrets; ``sha256`` and ``bytes`` of it; ``hosts`` that its
     tiles' servers may redirect to; ``ground`` that was asked for, as runs of cells
-    (:class:`.footprint.Footprint`), ``footprint_m2`` its area, ``hole_m2`` of it in no tile;
+    (:class:`.lattice.Footprint`), ``footprint_m2`` its area, ``hole_m2`` of it in no tile;
     ``crs``: that of all tiles by the catalogue, or empty.
     """
 

@@ -18,7 +18,7 @@ from ..core.products.files import atomic_file
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from ..lidar.catalogue_list import is_catalogue, write_list
-from ..lidar.overlap_check import apart, refuse_apart
+from ..lidar.lattice import apart, refuse_apart
 from .check_lidar import check_lidar
 from .check_scene import boxes_of, ground_of
 from .check_tiles import Nodes, check_frame

@@ -11,10 +11,10 @@ from ..core.dates import epoch_year
 from ..core.errors import InputError, in_number, in_words
 from ..core.products.remote_files import url_of
 from ..core.sheets import Scene
-from ..lidar.footprint import Footprint
 from ..lidar.frames import Epoch, Epochs
-from ..lidar.geoid_candidates import candidates_at, named
-from ..lidar.survey import SurveyedFile, survey
+from ..lidar.geoid import candidates_at, named
+from ..lidar.ingest import SurveyedFile, survey
+from ..lidar.lattice import Footprint
 from .findings import Findings, Level
 
 AT_ONCE = 8  # files of servers that are looked at

@@ -12,10 +12,9 @@ from ..core.errors import InputError, in_words
 from ..core.job import in_own_process
 from ..core.products.remote_files import url_of
 from ..core.sheets import Scene
-from ..lidar.ingest import ingest
+from ..lidar.ingest import SurveyedFile, ingest
 from ..lidar.point_store import PointStore
 from ..lidar.strip_comparison import compare_strips
-from ..lidar.survey import SurveyedFile
 from .findings import Findings, Level
 
 MOST_POINTS = 6_000_000  # read and compared in seven seconds

@@ -14,7 +14,7 @@ from ..core.errors import in_number
 from ..core.numerics.degrees import DEGREE_M
 from ..core.numerics.summed_area import summed_area, window_sums
 from ..epipolar.model import EpipolarModel
-from ..lidar.survey import SurveyedFile
+from ..lidar.ingest import SurveyedFile
 from ..tiles.windows import cell_step
 from .estimates import estimates
 from .findings import Findings, Level

@@ -30,9 +30,8 @@ from ..core.products.inputs import refuse_replaced
 from ..core.products.locks import FileLock
 from ..core.products.making import marks_of_inputs
 from ..core.products.provenance import describe, digest
-from ..lidar.density import points_per_m2
-from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
-from ..lidar.overlap_check import refuse_apart
+from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, refuse_apart
+from ..lidar.point_statistics import points_per_m2
 from ..lidar.point_store import PointStore
 from .scale import PART, SurfaceScale
 from .shown_blocks import Box, Number, ShownBlocks, ShownGround

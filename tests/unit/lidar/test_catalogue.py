@@ -25,7 +25,7 @@ from stereotruth.lidar.catalogue_list import (
     unlisted_m2,
     write_list,
 )
-from stereotruth.lidar.footprint import CELL_DEG, Footprint
+from stereotruth.lidar.lattice import CELL_DEG, Footprint
 
 WEST, SOUTH = 5.0, 43.0
 SIDE = 0.01

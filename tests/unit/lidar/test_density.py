@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.lidar.density import points_per_m2
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_statistics import points_per_m2
 from stereotruth.lidar.point_store import PointStore, open_stores
 
 from ...synthetic.las import write_las

@@ -14,11 +14,10 @@ from scipy.spatial import cKDTree
 
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.declared_crs import header_crs, interpret
-from stereotruth.lidar.footprint import Footprint
-from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.ingest import ingest, survey
+from stereotruth.lidar.lattice import Footprint
 from stereotruth.lidar.point_files import open_octree
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.lidar.survey import survey
 
 from ...synthetic.copc_server import CORNER, UTM, serving
 from ...synthetic.ept import FAULTS, _about, make_ept, write

@@ -11,9 +11,9 @@ import pytest
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.numerics.degrees import metres_per_degree
-from stereotruth.lidar.density import points_per_m2
-from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.lattice import CELL_DEG, Footprint
+from stereotruth.lidar.point_statistics import points_per_m2
 from stereotruth.lidar.point_store import PointStore, open_stores, query_points
 
 from ...synthetic.copc_server import CORNER, make_copc

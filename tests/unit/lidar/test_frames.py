@@ -17,11 +17,18 @@ from pyproj import CRS
 from rasterio.transform import from_origin
 
 from stereotruth.core.errors import InputError
-from stereotruth.lidar.frames import DEFAULT_EPOCH, Epoch, Epochs, frame_change
+from stereotruth.lidar.frames import (
+    DEFAULT_EPOCH,
+    Epoch,
+    Epochs,
+    frame_change,
+    moved,
+    plate_at,
+    speed,
+)
+from stereotruth.lidar.height_raster import raster_header
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.plate_motion import moved, plate_at, speed
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.lidar.raster_points import raster_header
 from stereotruth.lidar.to_wgs84 import to_wgs84
 
 from ...synthetic.las import everything, header_of, write_gtx, write_las

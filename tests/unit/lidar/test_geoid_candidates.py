@@ -7,7 +7,7 @@ import sqlite3
 import pytest
 
 from stereotruth.lidar import geoid_candidates
-from stereotruth.lidar.geoid_candidates import candidates_at, fits, grid_of, named
+from stereotruth.lidar.geoid import candidates_at, fits, grid_of, named
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from stereotruth.lidar.footprint import Footprint
-from stereotruth.lidar.gps_times import days_by_code, number_of
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.lattice import Footprint
+from stereotruth.lidar.point_fields import days_by_code, number_of
 from stereotruth.lidar.point_store import PointStore, query_points
 
 from ...synthetic.las import adjusted, everything, write_las

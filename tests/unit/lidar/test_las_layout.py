@@ -10,7 +10,7 @@ import laspy
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.lidar.las_layout import check_layout
+from stereotruth.lidar.las_files import check_layout
 
 from ...synthetic.las import refused, write_las
 

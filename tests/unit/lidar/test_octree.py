@@ -16,11 +16,10 @@ import pytest
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.file_parts import FOLDER
 from stereotruth.core.products.remote_files import bring_files
-from stereotruth.lidar.footprint import Footprint
-from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.ingest import ingest, survey
+from stereotruth.lidar.lattice import Footprint
 from stereotruth.lidar.point_files import open_octree
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.lidar.survey import survey
 
 from ...synthetic import object_storage
 from ...synthetic.copc_server import (

@@ -13,9 +13,8 @@ from rasterio.transform import Affine
 from stereotruth.core.errors import InputError
 from stereotruth.core.products import raster_values
 from stereotruth.lidar import raster_points
-from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.ingest import ingest, survey
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.lidar.survey import survey
 
 from ...synthetic.copc_server import serving
 from ...synthetic.las import FT, SOUTH, US_FT, WEST, everything, refused, write_gtx

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.point_statistics import roughness_m
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.lidar.roughness import roughness_m
 
 from ...synthetic.las import write_las
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.lattice import Footprint
+from stereotruth.lidar.point_fields import runs_of
 from stereotruth.lidar.point_store import STRIPS, PointStore
-from stereotruth.lidar.strip_codes import runs_of
 from stereotruth.lidar.strip_comparison import compare_strips
-from stereotruth.lidar.strip_moves import move_strips
-from stereotruth.lidar.strip_offsets import StripOffsets
+from stereotruth.lidar.strips import StripOffsets, move_strips
 
 from ...synthetic.stores import content_of
 from ...synthetic.strips import OFFSETS, stores

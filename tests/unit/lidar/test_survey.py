@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.survey import survey
+from stereotruth.lidar.ingest import ingest, survey
 
 from ...synthetic.las import write_las
 
