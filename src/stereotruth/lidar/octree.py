@@ -5,8 +5,7 @@ points of a footprint follows from the octree's own cube, never from the header'
 writers get wrong. Before any point is read, the counts of all nodes of the hierarchy must add up to
 the header's count. While points are read, each node must hold as many as the hierarchy says, all of
 them within the node's cube: else other nodes may hold points of the footprint too, and the file is
-refused. Where all points of a node lie in the cube of one below it, the hierarchy may have
-exchanged the two: the other is read as well, and must keep to its own cube.
+refused.
 
 COPC is a LAZ file whose chunks are the nodes: its chunk table and its hierarchy tell the same by
 different ways, so that a node that one of them lacks is found without reading it. laspy's own
@@ -24,7 +23,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -131,7 +129,7 @@ class Octree(ABC):
         level = self.nodes["key"][:, 0]
         if level[wanted].max() < level.max():
             wanted[np.argmax(level)] = True
-        wanted[min(self._number_of.items())[1]] = True
+        wanted[np.lexsort(self.nodes["key"].T[::-1])[0]] = True  # the root
         return np.flatnonzero(wanted)
 
     def read(self, numbers: Numbers) -> Iterator[ScaleAwarePointRecord]:
@@ -142,53 +140,19 @@ class Octree(ABC):
         Raises InputError: a node of other points than the hierarchy says, or points out of its
         cube; what a server or a damaged file fails with.
         """
-        looked, is_wanted = set(numbers.tolist()), True
-        while numbers.size:
-            doubted: set[int] = set()
-            for node, points in zip(self.nodes[numbers], self._decoded(numbers), strict=True):
-                doubted |= self._below(int(node["key"][0]), self._checked(node, points))
-                if is_wanted:
-                    yield points
-            numbers, is_wanted = np.array(sorted(doubted - looked), np.intp), False
-            looked |= doubted
+        for node, points in zip(self.nodes[numbers], self._decoded(numbers), strict=True):
+            if len(points) != node["points"]:
+                raise self._refusal(
+                    f"node {shown(node)} holds {len(points)} points, the hierarchy says "
+                    f"{node['points']}"
+                )
+            stored = np.stack([points.array[axis] for axis in "XYZ"], axis=1)
+            self._refuse_outside(stored, node.reshape(1))
+            yield points
 
-    def _below(self, level: int, xyz: Floats) -> set[int]:
-        """Numbers of the nodes below a level whose cubes hold all of some points [n, 3]."""
-        low, high = xyz.min(axis=0) - self.low, xyz.max(axis=0) - self.low
-        slack = np.minimum(STEPS_OUTSIDE * np.asarray(self.header.scales), (high - low) / 2)
-        corners = np.stack([low + slack, high - slack])  # a point on a face may be either node's
-        inside: set[int] = set()
-        for deeper in range(level + 1, int(self.nodes["key"][:, 0].max()) + 1):
-            first, last = np.floor(corners / (self.side / 2.0**deeper))
-            if (first != last).any():
-                break
-            if (number := self._number_of.get((deeper, *map(int, first)))) is not None:
-                inside.add(number)
-        return inside
-
-    @cached_property
-    def _number_of(self) -> dict[tuple[int, ...], int]:
-        """Numbers of the nodes by key."""
-        return {tuple(key): number for number, key in enumerate(self.nodes["key"].tolist())}
-
-    def _checked(self, node: np.void, points: ScaleAwarePointRecord) -> Floats:
-        """Coordinates [n, 3] of a node's points, all of which lie in its cube."""
-        if len(points) != node["points"]:
-            raise self._refusal(
-                f"node {shown(node)} holds {len(points)} points, the hierarchy says "
-                f"{node['points']}"
-            )
-        stored = np.stack([points.array[axis] for axis in "XYZ"], axis=1)
-        xyz = self._coordinates(stored)
-        self._refuse_outside(xyz, node.reshape(1))
-        return xyz
-
-    def _coordinates(self, stored: np.ndarray) -> Floats:
-        """Of stored integers [n, 3]."""
-        return stored * np.asarray(self.header.scales) + np.asarray(self.header.offsets)
-
-    def _refuse_outside(self, xyz: Floats, nodes: np.ndarray) -> None:
+    def _refuse_outside(self, stored: NDArray[np.int32], nodes: np.ndarray) -> None:
         """Raise InputError unless each point [n, 3] lies in the cube of its node, or of the one."""
+        xyz = stored * np.asarray(self.header.scales) + np.asarray(self.header.offsets)
         low, high = self.boxes(nodes)
         outside = ((xyz < low) | (xyz > high)).any(axis=1)
         if outside.any():
@@ -205,7 +169,7 @@ class Octree(ABC):
         good &= (np.array(at) < 2 ** np.clip(level, 0, MOST_LEVELS)).all(axis=0)
         if not good.all():
             raise self._refusal(f"its hierarchy has a node {shown(self.nodes[np.argmin(good)])}")
-        if len(self._number_of) < len(self.nodes):
+        if len(np.unique(self.nodes["key"], axis=0)) < len(self.nodes):
             raise self._refusal("a node stands twice in its hierarchy")
         held, wanted = int(self.nodes["points"].sum()), int(self.header.point_count)
         if held != wanted:
@@ -275,7 +239,7 @@ class Copc(Octree):
                 # though it is not read.
                 first = self._parts.get([(at, at + 12) for at in self.nodes["start"].tolist()])
                 stored = np.frombuffer(b"".join(first), "<i4").reshape(-1, 3)
-                self._refuse_outside(self._coordinates(stored), self.nodes)
+                self._refuse_outside(stored, self.nodes)
 
     def _systems_behind(self, stream: BinaryIO, layout: Layout) -> list[laspy.VLR]:
         """The records behind the points that declare a coordinate system."""
@@ -313,7 +277,6 @@ class Copc(Octree):
                 entries += len(page)
             require(entries <= MOST_NODES, "its hierarchy is too large")
         every = np.concatenate(found)
-        require(len(np.unique(every["key"], axis=0)) == len(every), "a node stands in it twice")
         require(not every["key"][:, 0].min(), "its hierarchy has no root")
         require(bool((every["points"] >= 0).all()), "a node has less than no points")
         nodes = every[every["points"] > 0].astype(NODE)

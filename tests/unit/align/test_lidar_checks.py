@@ -24,7 +24,7 @@ from stereotruth.align.lidar_checks import (
     lines_of_sight,
 )
 from stereotruth.align.refine import refine
-from stereotruth.lidar import geoid_candidates
+from stereotruth.lidar import geoid as geoid_candidates
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 

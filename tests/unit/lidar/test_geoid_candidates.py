@@ -6,7 +6,7 @@ import sqlite3
 
 import pytest
 
-from stereotruth.lidar import geoid_candidates
+from stereotruth.lidar import geoid as geoid_candidates
 from stereotruth.lidar.geoid import candidates_at, fits, grid_of, named
 
 

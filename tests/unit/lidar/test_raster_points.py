@@ -12,7 +12,7 @@ from rasterio.transform import Affine
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.products import raster_values
-from stereotruth.lidar import raster_points
+from stereotruth.lidar import height_raster as raster_points
 from stereotruth.lidar.ingest import ingest, survey
 from stereotruth.lidar.point_store import PointStore
 
