@@ -280,7 +280,6 @@ class _Parts(io.RawIOBase):
 
     def __init__(self, file: Path) -> None:
         self._name, self._stream = file.name, open_stream(file, STREAM_BYTES)
-        self.tell, self.seek = self._stream.tell, self._stream.seek
         self.failure: InputError | None = None
 
     def opened(self, path: str, mode: str = "rb") -> _Parts:
@@ -297,6 +296,14 @@ class _Parts(io.RawIOBase):
         """It is."""
         return True
 
+    def tell(self) -> int:
+        """The place of the next byte."""
+        return self._stream.tell()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place, as of any stream."""
+        return self._stream.seek(offset, whence)
+
     def read(self, size: int = -1) -> bytes:
         """So many bytes; none after an error."""
         try:
@@ -307,8 +314,8 @@ class _Parts(io.RawIOBase):
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[Values]:
-    """The values of a raster of heights. Raises InputError if it is no such raster.
+def _opened(file: Path) -> Iterator[tuple[Values, LidarCRS | None]]:
+    """The values and the system of a raster of heights. Raises InputError if it is no such raster.
 
     Of a stand-in, GDAL is given the parts that servers send to this package: left to itself it
     follows redirects to anywhere.
@@ -336,7 +343,8 @@ def _opened(file: Path) -> Iterator[Values]:
                         "several files",
                     )
                 system = _system_of(raster, file)
-                yield Values(raster, file, HEIGHT, 1.0 if system is None else system.height_unit_m)
+                unit_m = 1.0 if system is None else system.height_unit_m
+                yield Values(raster, file, HEIGHT, unit_m), system
         except RasterioError as error:
             if parts is not None and parts.failure is not None:
                 raise parts.failure from None
@@ -356,7 +364,7 @@ def raster_header(file: Path) -> laspy.LasHeader:
     """
     if not file.is_file():
         raise InputError("no such LiDAR file", file=file, remedy="correct the path in scenes.tsv")
-    with _opened(file) as values:
+    with _opened(file) as (values, system):
         raster = values.dataset
         at, (rows, cols) = raster.transform, raster.shape
         header = laspy.LasHeader(point_format=6, version="1.4")
@@ -367,7 +375,7 @@ def raster_header(file: Path) -> laspy.LasHeader:
         header.mins = np.array([*(header.offsets[:2] + half), np.nan])
         header.maxs = np.array([*(header.offsets[:2] + size - half), np.nan])
         header.point_count = rows * cols
-        if (system := _system_of(raster, file)) is not None:
+        if system is not None:
             wkt = pyproj.CRS.from_wkt(raster.crs.to_wkt()).to_wkt()
             if not system.has_vertical and system.vertical_unit_m is not None:  # of the band
                 wkt = (
@@ -388,7 +396,7 @@ def sampled_heights(file: Path) -> tuple[float, float] | None:
     Of a raster of :data:`.raster_values.MOST_CELLS` at most, of all. Raises InputError for values
     that are no heights.
     """
-    with _opened(file) as values:
+    with _opened(file) as (values, _):
         height, width = values.dataset.shape
         if width * height <= MOST_CELLS and url_of(file) is None:
             values.refuse_fills()
@@ -402,7 +410,7 @@ def read_cells(file: Path, header: laspy.LasHeader) -> Iterator[laspy.ScaleAware
 
     Raises InputError for values that are no heights, and for a raster that became unreadable.
     """
-    with _opened(file) as values:
+    with _opened(file) as (values, _):
         fills = Fills(values)
         for window in values.windows():
             heights = fills.add(*values.raw(window=window))
