@@ -241,13 +241,6 @@ def test_taken_tiles_are_all_that_share_a_place_with_the_footprint():
             assert cover_of([tile(corners)], footprint).taken == (0,)
 
 
-def test_a_slanting_outline_is_taken_only_where_it_is():
-    corners = [[0, 0], [10, 10], [9.8, 10.2], [-0.2, 0.2]]  # a narrow strip
-    strip = tile([[WEST + x * SIDE, SOUTH + y * SIDE] for x, y in corners])
-    off = around(WEST + 8 * SIDE, SOUTH + 2 * SIDE, WEST + 8.1 * SIDE, SOUTH + 2.1 * SIDE)
-    assert cover_of([strip], off).taken == ()
-
-
 def test_ground_that_no_tile_covers_is_named_with_its_area():
     tiles = [tile(square(k, row)) for row in range(3) for k in range(3) if (k, row) != (1, 1)]
     footprint = around(WEST + 0.1 * SIDE, SOUTH + 0.1 * SIDE, WEST + 2.9 * SIDE, SOUTH + 2.9 * SIDE)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import laspy
-import numpy as np
 import pyproj
 import pytest
 
 from stereotruth.core.errors import InputError
 from stereotruth.lidar import declared_crs
-from stereotruth.lidar.las_files import read_header
 
 from ...synthetic.las import FT, NAVD88_FTUS, US_FT, UTM_10, UTM_WKT1, header_of
-from ...synthetic.real_data import SHARED
 
 
 @pytest.mark.parametrize(
@@ -129,34 +125,6 @@ def test_the_header_bit_decides_between_wkt_and_geokeys() -> None:
     assert with_vertical.vertical_datum == "NAVD88 height"
 
 
-def test_wkt_in_an_extended_record(tmp_path) -> None:
-    las = laspy.LasData(header_of())
-    las.x, las.y, las.z = [np.array([1.0])] * 3
-    las.evlrs = laspy.vlrs.vlrlist.VLRList(
-        [laspy.VLR("LASF_Projection", 2112, "", UTM_WKT1.encode() + b"\0")]
-    )
-    las.write(tmp_path / "a.laz")
-    header = read_header(tmp_path / "a.laz")
-    assert not any(record.user_id == "LASF_Projection" for record in header.vlrs)
-    assert declared_crs.header_crs(header)[0].horizontal.to_epsg() == 32610
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="shared real files are absent")
-def test_user_defined_geokeys_agree_with_wkt_on_a_real_file() -> None:
-    with laspy.open(SHARED / "lidar" / "autzen_trim.laz") as reader:
-        header = reader.header
-    transformers = []
-    for wkt_bit in (False, True):
-        header.global_encoding.wkt = wkt_bit
-        system, _ = declared_crs.header_crs(header)
-        assert system.horizontal_unit_m == pytest.approx(FT)
-        transformers.append(
-            pyproj.Transformer.from_crs(system.horizontal, "EPSG:4326", always_xy=True)
-        )
-    places = [t.transform(636001.76, 848935.20) for t in transformers]
-    np.testing.assert_allclose(*places, rtol=0, atol=1e-9)  # 0.1 mm
-
-
 def test_the_file_wins_over_lidar_crs_and_says_so() -> None:
     system, notes = declared_crs.resolve(header_of(UTM_WKT1), "EPSG:32611", "a.laz")
     assert system.horizontal.to_epsg() == 32610
@@ -171,11 +139,3 @@ def test_lidar_crs_supplies_the_vertical_part_that_a_file_lacks() -> None:
     system, notes = declared_crs.resolve(header, "EPSG:2154+5720", "a.laz")
     assert system.vertical_datum == "NGF-IGN69 height"
     assert any("NGF-IGN69" in note for note in notes)
-
-
-def test_unreadable_wkt_falls_back_to_lidar_crs() -> None:
-    system, notes = declared_crs.resolve(header_of("PROJCS[broken"), "EPSG:32610", "a.laz")
-    assert system.horizontal.to_epsg() == 32610
-    assert any("WKT" in note for note in notes)
-    with pytest.raises(InputError, match="WKT cannot be used"):
-        declared_crs.resolve(header_of("PROJCS[broken"), None, "a.laz")

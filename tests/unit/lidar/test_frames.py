@@ -22,14 +22,12 @@ from stereotruth.lidar.frames import (
     Epoch,
     Epochs,
     frame_change,
-    moved,
     plate_at,
-    speed,
 )
 from stereotruth.lidar.height_raster import raster_header
 from stereotruth.lidar.to_wgs84 import to_wgs84
 
-from ...synthetic.las import header_of, write_gtx
+from ...synthetic.las import header_of
 
 # x, y, z (m), rx, ry, rz ("), s (ppm), their rates a year, and the epoch of the parameters.
 NAD83 = (  # EPSG:10334, ITRF2020 to NAD83(2011); EPSG:10415, to NAD83(CSRS)v8, is the same
@@ -59,8 +57,6 @@ ITRF96_AT_2000 = (
 PLATES = {  # file ITRF2020 of PROJ: plate motion model of Altamimi et al. (2023)
     "AUST": "+drx=0.001487 +dry=0.001175 +drz=0.001223",
     "PCFC": "+drx=-0.000404 +dry=0.001021 +drz=-0.002154",
-    "NOAM": "+drx=0.000045 +dry=-0.000666 +drz=-0.000098",
-    "EURA": "+drx=-0.000085 +dry=-0.000519 +drz=0.000753",
 }
 BIAS = "+dx=0.00037 +dy=0.00035 +dz=0.00074"
 
@@ -147,17 +143,6 @@ def test_frames_are_known_by_their_names_alone(code, place, form) -> None:
     assert np.abs(metres(found, judge)).max() < 1e-4
 
 
-def test_a_geoid_counts_from_the_frame_of_the_file(tmp_path) -> None:
-    """GEOID18 is above NAD83(2011): H + N first, then the frame; EGM grids are above ITRF."""
-    place, height = (-81.66, 30.33), 12.0
-    values = np.full((31, 31), -28.0)
-    for name, expected in (("g2018.gtx", NAD83), ("egm2008.gtx", None)):
-        geoid = write_gtx(tmp_path / name, values, -83.0, 29.0, 0.1)
-        found = placed(6346, *place, height, at(2020.0), geoid=geoid)
-        up = by_proj(NAD83, *place, height - 28, 2020.0)[2] if expected else height - 28
-        assert found[2] == pytest.approx(up, abs=1e-3)
-
-
 # ------------------------------------------------------------------ WGS 84 and dynamic frames
 
 
@@ -229,28 +214,6 @@ def test_other_frames_are_left_to_proj(code, place) -> None:
 
 
 # ------------------------------------------------------------------ plates
-
-
-@pytest.mark.parametrize(
-    ("name", "steps", "place", "within"),
-    [
-        ("EURA", ETRF2020, (10.0, 50.0), 0.010),  # the bias of the origin, 0.9 mm a year
-        ("AUST", GDA2020, (135.0, -25.0), 0.015),
-        ("NOAM", NAD83, (-95.0, 40.0), 0.030),  # NUVEL-1A, of 1994
-    ],
-)
-def test_plates_move_as_proj_moves_the_frames_that_are_fixed_to_them(
-    name, steps, place, within
-) -> None:
-    assert plate_at(*place) == name
-    first, last = (by_proj(steps, *place, 0.0, year) for year in (2012.0, 2022.0))
-    found = np.array(moved(*(np.array([v]) for v in first), name, 10.0))[:, 0]
-    assert np.hypot(*metres(found, last)[:2]) < within
-    assert (
-        0.1
-        < np.hypot(*metres(last, first)[:2])
-        == pytest.approx(10 * speed(*place, name), abs=within)
-    )
 
 
 @pytest.mark.parametrize(

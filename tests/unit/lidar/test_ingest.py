@@ -118,19 +118,6 @@ def test_points_of_a_cell_keep_the_order_of_the_file(tmp_path) -> None:
         assert (np.diff(part) > 0).all()
 
 
-def test_southern_and_western_hemisphere(tmp_path) -> None:
-    xyz = np.random.default_rng(0).uniform(0, 300, (500, 3))
-    xyz += [320_000, 6_250_000, 0]
-    xyz = write_las(tmp_path / "a.laz", xyz=xyz, system=pyproj.CRS("EPSG:32719").to_3d())
-    ingest(tmp_path / "a.laz", tmp_path / "a.points")
-    got = everything(PointStore(tmp_path / "a.points"))
-    lon, lat = pyproj.Transformer.from_crs(32719, 4326, always_xy=True).transform(*xyz.T[:2])
-    assert lon.max() < -70
-    assert lat.max() < -33
-    expected = by_position(lon, lat, xyz[:, 2])
-    np.testing.assert_allclose(by_position(got.lon, got.lat, got.height), expected, atol=1)
-
-
 @pytest.mark.parametrize("pdrf", [1, 6])
 def test_noise_and_withheld_points_are_dropped_and_counted(tmp_path, pdrf) -> None:
     classes = np.full(1000, 2, np.uint8)
@@ -160,14 +147,6 @@ def test_noise_and_withheld_points_are_dropped_and_counted(tmp_path, pdrf) -> No
     assert kept["points"]["kept"] == 890
 
 
-def test_no_crs_names_lidar_crs(tmp_path) -> None:
-    xyz = write_las(tmp_path / "a.laz", system=None)
-    refused(tmp_path / "a.laz", "lidar_crs")
-    refused(tmp_path / "a.laz", "outside of the area", lidar_crs="EPSG:2193")
-    ingest(tmp_path / "a.laz", tmp_path / "a.points", lidar_crs="EPSG:32650")
-    assert PointStore(tmp_path / "a.points").count == len(xyz)
-
-
 def test_places_off_the_earth(tmp_path) -> None:
     xyz = np.random.default_rng(0).uniform(0, 100, (1000, 3))
     xyz += [3e8, 3e8, 0]
@@ -183,15 +162,6 @@ def test_coarse_and_quantised_coordinates(tmp_path) -> None:
     refused(tmp_path / "a.laz", "steps of 0.01, 1113 m on the ground")
     write_las(tmp_path / "b.laz", xyz=np.round(xyz, 2), system=system, scale=1e-7)
     refused(tmp_path / "b.laz", r"2000 points lie on \d+ positions")
-
-
-def test_geoid_that_misses_the_points_names_both_files(tmp_path) -> None:
-    head = struct.pack(">4d2i", 10.0, 10.0, 0.1, 0.1, 11, 11)
-    (tmp_path / "small.gtx").write_bytes(head + np.full(121, 30.0, ">f4").tobytes())
-    write_las(tmp_path / "a.laz", system=pyproj.CRS("EPSG:32650+3855"))
-    refused(tmp_path / "a.laz", "EGM2008 height.*geoid")
-    message = refused(tmp_path / "a.laz", "3000 points", geoid=tmp_path / "small.gtx")
-    assert "small.gtx" in message
 
 
 def test_heights_with_a_geoid_and_survey_feet(tmp_path) -> None:

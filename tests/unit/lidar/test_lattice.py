@@ -15,9 +15,8 @@ from stereotruth.lidar.las_files import is_outside_sampled, read_header
 from stereotruth.lidar.lattice import CELL_DEG, Footprint, refuse_apart
 from stereotruth.lidar.point_statistics import points_per_m2
 from stereotruth.lidar.point_store import PointStore, open_stores, query_points
-from stereotruth.lidar.to_wgs84 import to_wgs84
 
-from ...synthetic.las import SOUTH, UTM, WEST, header_of, write_las
+from ...synthetic.las import SOUTH, WEST, write_las
 from ...synthetic.stores import content_of, part_of
 from ...synthetic.surface_rasters import write_raster
 
@@ -140,29 +139,6 @@ def test_a_store_without_points_opens_answers_and_has_no_say(tmp_path, monkeypat
     assert [s.path for s in open_stores([empty.path, full.path])] == [full.path]
     assert [s.path for s in open_stores([empty.path])] == [empty.path]
     assert points_per_m2([full, empty]) == points_per_m2([full])
-
-
-def test_a_file_whose_points_are_all_dropped_is_refused_still(tmp_path):
-    write_las(tmp_path / "a.laz", 100, classification=np.full(100, 7, np.uint8))
-    footprint = Footprint.around([square(LON, LAT, 9000)], 0.0)
-    with pytest.raises(InputError, match="no point is left of 100"):
-        ingested(tmp_path / "a.laz", footprint)
-
-
-def test_degrees_of_boxes_lie_around_their_ground():
-    """Boxes of some metres to 100 km against a fine grid of their places."""
-    corner = np.array([WEST, SOUTH, 0.0])
-    header = header_of(UTM.to_wkt(), low=tuple(corner))
-    transform = to_wgs84(header, "a.las")
-    for side in (10.0, 1000.0, 1e5):
-        low = corner + side * np.array([[-2, 0, 0], [1, 3, 0]])
-        boxes = transform.ground_boxes(low, low + side)
-        for box, at in zip(boxes, low):
-            x, y = np.meshgrid(*(at[k] + side * np.linspace(0, 1, 60) for k in (0, 1)))
-            lon, lat, _ = transform(x.ravel(), y.ravel(), np.zeros(x.size))
-            assert box[0] <= lon.min() and lon.max() <= box[2]
-            assert box[1] <= lat.min() and lat.max() <= box[3]
-            assert box[2] - box[0] < 1.2 * np.ptp(lon)
 
 
 @pytest.mark.parametrize(

@@ -257,16 +257,6 @@ def test_the_store_of_a_bucket_is_that_of_the_disk_and_asked_for_once(bucket, mo
     assert content_of(PointStore("again.points")) == content_of(disk)
 
 
-def test_an_object_that_has_changed_is_refused(bucket):
-    server, files = bucket
-    content = (files / "tile.copc.laz").read_bytes()
-    server.put("lidar/other.copc.laz", content)
-    place = bring_files("s3://bucket/lidar/other.copc.laz", (".laz",))
-    server.put("lidar/other.copc.laz", content[:-1] + b"x")
-    with pytest.raises(InputError, match="changed on its server"):
-        ingest(place, Path("a.points"), footprint=AREA)
-
-
 # ------------------------------------------------------------------ Entwine Point Tiles
 
 
@@ -352,10 +342,3 @@ def test_nodes_of_a_server_are_those_of_the_disk_and_asked_for_once(dataset, goo
         assert server.requests == []
     for name in ("web", "again"):
         assert content_of(PointStore(f"{name}.points")) == good["part"]
-
-
-def test_a_node_that_leads_to_another_host_is_refused(dataset):
-    with serving(dataset.parent, "redirect to another host", when=2) as server:
-        with pytest.raises(InputError, match="another host"):
-            open_octree(server.stand_in("ept.json"))
-        assert len(server.requests) > 2

@@ -54,21 +54,6 @@ def test_query_is_exact_inclusive_and_in_stored_order(store) -> None:
     assert np.array_equal(store.square_counts.sum(axis=(1, 2)), store.cell_counts)
 
 
-def test_files_hold_together_what_one_does(tmp_path) -> None:
-    """In either order."""
-    xyz = write_las(tmp_path / "all.laz", 4000)
-    for name, part in (("all", xyz), ("a", xyz[:1500]), ("b", xyz[1500:])):
-        write_las(tmp_path / f"{name}.laz", xyz=part)
-        ingest(tmp_path / f"{name}.laz", tmp_path / f"{name}.points")
-    west, south, east, north = PointStore(tmp_path / "all.points").bounds[:4]
-    box = (west, south, (west + east) / 2, (south + north) / 2)
-    expected = PointStore(tmp_path / "all.points").query(*box)
-    for names in ("ab", "ba"):
-        got = query_points([tmp_path / f"{name}.points" for name in names], *box)
-        assert len(got) == len(expected) > 500
-        assert np.array_equal(np.sort(got.lon_q), np.sort(expected.lon_q))
-
-
 def test_only_whole_point_stores_of_this_format_open(store, tmp_path) -> None:
     with pytest.raises(InputError, match="no such"):
         PointStore(tmp_path / "none.points")
