@@ -155,21 +155,19 @@ def ingest(
 
     Withheld points are dropped, and those of ``drop_classes``. Synthetic points, overlap points and
     producers' own classes (65 and 67 mark artefacts in IGN's files) are kept unless listed.
-    ``lidar_crs`` (EPSG or WKT) and ``geoid`` (path of a grid) as in scenes.tsv (:mod:`.to_wgs84`);
-    None or "" where not needed; ``epochs`` of the images, and of the coordinates where files state
-    none (:mod:`.frames`); None: frames are what PROJ takes them for.
-    ``footprint``: the ground whose points are kept; of octrees just the nodes that touch it are
-    read, other files whole or not at all (:mod:`.point_files`). ``acquired``: first and last day
-    (ISO) by a catalogue, for files whose points do not tell them.
+    ``lidar_crs`` (EPSG or WKT), ``geoid`` (path of a grid): see :mod:`.to_wgs84`; ``epochs``: see
+    :mod:`.frames`. ``footprint``: the ground whose points are kept; of octrees just the nodes that
+    touch it are read, other files whole or not at all (:mod:`.point_files`). ``acquired``: first
+    and last day (ISO) by a catalogue, for files whose points do not tell them.
 
     Returns what is also in the store's attributes: ``points`` (header, read, outside of the
-    footprint, kept, dropped by reason), ``nodes`` of an octree (read, all), ``bytes`` (read, all),
+    footprint, kept, dropped by reason), ``nodes`` of an octree and ``bytes`` (read, all),
     ``classes`` (points read by class), ``bounds`` (lon_min, lat_min, lon_max, lat_max in
     degrees, h_min, h_max in m; of no point: where all points of the file are about), ``crs``,
     ``footprint`` (runs of cells, or None), ``acquired`` (first and last day of all points read, and
-    what tells them; None where nothing does), ``days`` that points tell themselves (of more than
-    :data:`.point_fields.DAY_CODES` none), ``strips`` (what tells them, points by code),
-    ``notes`` and ``doubts`` (remarks; doubts change what labels are worth), which are logged too.
+    what tells them), ``days`` that points tell themselves (of more than DAY_CODES none), ``strips``
+    (what tells them, points by code), ``notes`` and ``doubts`` (remarks, which are logged too;
+    doubts change what labels are worth).
 
     Raises InputError: missing, empty, truncated or unreadable file; no usable coordinate system;
     orthometric heights without a geoid; points off the geoid grid, off the Earth or far outside the
@@ -205,12 +203,9 @@ def ingest(
                 is_whole = part.points == header.point_count
                 tally, runs = _read(points, part, transform, *reading)
         tally.refuse_quantised(file)
-        if runs.written:
-            bounds = bounds_of(tally.lattice_limits)
-        else:  # without the geoid, which need not reach there
-            box = np.nan_to_num(transform.ground_boxes(extent[:1], extent[1:])[0])
-            heights = np.array(points.heights or (0.0, 0.0)) * transform.system.height_unit_m
-            bounds = [*box.tolist(), *np.nan_to_num(heights).tolist()]
+        bounds = (
+            bounds_of(tally.lattice_limits) if runs.written else _about(transform, points, extent)
+        )
         told_by, bit, by_code = tally.strips
         days = tally.days
         summary = {
@@ -233,19 +228,7 @@ def ingest(
             "notes": _notes(points, part, transform, tally, bounds),
             "doubts": _doubts(tally, file),
         }
-        about = {
-            "kind": "points",
-            "format": FORMAT,
-            "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice "
-            f"of {LATTICE_DEG:g} degree and {LATTICE_M:g} m; cells of 2**{CELL_BITS} steps, "
-            "row-major; the order of the file inside a cell",
-            "arrays": ARRAYS,
-            "source": file.name,
-            "cell_bits": CELL_BITS,
-            "cells_crc32": None,
-            **summary,
-            "provenance": dict(provenance or {}),
-        }
+        about = {**_head(file), **summary, "provenance": dict(provenance or {})}
         runs.write(unfinished, about, bit if len(by_code) > 1 else None)
         summary["strips"] = about["strips"]
     _tell(file, summary, transform)
@@ -378,6 +361,31 @@ def _extent(header: laspy.LasHeader, tally: PointTally, is_whole: bool) -> Float
     slack = 2 * np.asarray(header.scales)
     agrees = (own[0] >= stated[0] - slack).all() and (own[1] <= stated[1] + slack).all()
     return stated if agrees and not is_whole else own
+
+
+def _about(transform: ToWGS84, points: PointFile, extent: Floats) -> list[float]:
+    """Bounds of a file of which no point is kept, by its lowest and highest coordinates.
+
+    Without the geoid, which need not reach there.
+    """
+    box = np.nan_to_num(transform.ground_boxes(extent[:1], extent[1:])[0])
+    heights = np.array(points.heights or (0.0, 0.0)) * transform.system.height_unit_m
+    return [*box.tolist(), *np.nan_to_num(heights).tolist()]
+
+
+def _head(file: Path) -> dict[str, Any]:
+    """The first attributes of a store."""
+    return {
+        "kind": "points",
+        "format": FORMAT,
+        "conventions": "WGS 84 longitude and latitude, ellipsoidal height, on the lattice "
+        f"of {LATTICE_DEG:g} degree and {LATTICE_M:g} m; cells of 2**{CELL_BITS} steps, "
+        "row-major; the order of the file inside a cell",
+        "arrays": ARRAYS,
+        "source": file.name,
+        "cell_bits": CELL_BITS,
+        "cells_crc32": None,
+    }
 
 
 def _acquired(days: Sequence[str], stated: Sequence[str]) -> dict[str, str] | None:
