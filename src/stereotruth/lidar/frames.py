@@ -1,32 +1,15 @@
 """From the terrestrial frame of coordinates to ITRF2020 at the date of the images.
 
-RPCs and control points by GNSS are in the ITRF of their day, which WGS 84 (G…) follows to a
-centimetre. National frames move with their plate, or stand still since an epoch of their own: they
-are 0.3 to 2 m away from it. To WGS 84 PROJ moves most of them by nothing, with an accuracy of 1 to
-4 m. So frames go to ITRF2020 here, in two legs that are both explicit, since PROJ does nothing when
-the epoch alone changes:
+Two legs, both explicit, since PROJ does nothing when the epoch alone changes: the frame to ITRF2020
+at the epoch of the coordinates, by PROJ's time-dependent transformation or that of the ITRF that
+the frame is a realisation of (:data:`REALISATIONS`); and from that epoch to that of the target by
+the motion of the plate. Which epoch the coordinates of a frame have: docs/explanation/frames.md.
 
-1. the frame to ITRF2020 at the epoch of the coordinates, by PROJ's time-dependent transformation
-   (Helmert, 14 parameters, EPSG's) or that of the ITRF that the frame is a realisation of;
-2. from that epoch to that of the target by the motion of the plate.
-
-What the epoch of the coordinates is follows from the kind of frame:
-
-- a frame that moves with its plate (NAD83, ETRS89, GDA2020): coordinates hold at any time, and the
-  first leg is taken at the target's epoch;
-- a frame that stands for ITRF at one epoch (NZGD2000: ITRF96 at 2000.0): that epoch;
-- a dynamic frame (ITRF2014, WGS 84 (G1762)): the epoch that the file or ``lidar_epoch`` states;
-- WGS 84 without a realisation names no frame: ITRF2020, at the stated epoch, or else at the
-  target's.
-
-Plates: Altamimi, Métivier, Rebischung, Collilieux, Chanard, Barnéoud (2023), ITRF2020 Plate Motion
-Model, Geophysical Research Letters 50, e2023GL106373, doi 10.1029/2023GL106373, tables 1 and 2. As
-the paper advises, the bias of the origin's rate is added to the horizontal velocities, and what it
-makes of vertical ones is left out. The plates' outlines are coarse: straight lines between places
-that lie some tens of km beside the boundaries of Bird (2003, doi 10.1029/2001GC000252). Zones that
-belong to no rigid plate of the model (Japan, Taiwan, Indonesia, Anatolia, Iceland, the Andes'
-coast) lie in none of them. Within 200 km of a boundary the ground moves by up to some cm a year
-otherwise than the plate.
+Plates: ITRF2020 Plate Motion Model, Altamimi et al. (2023), doi 10.1029/2023GL106373, tables 1 and
+2. As the paper advises, the bias of the origin's rate is added to the horizontal velocities, and
+what it makes of vertical ones is left out. The plates' outlines are coarse: straight lines between
+places that lie some tens of km beside the boundaries of Bird (2003, doi 10.1029/2001GC000252).
+Zones that belong to no rigid plate of the model (Japan, Anatolia, Iceland …) lie in none of them.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 The one reader of surface models and elevation models, for LiDAR, scores and control points: values
 by :mod:`..core.products.raster_values`, systems by :mod:`.declared_crs`, datums by
-:mod:`.to_wgs84`. Pixels that are points (AREA_OR_POINT) are the middles of their cells: GDAL brings
-the grid to that.
+:mod:`.to_wgs84`. Pixels that are points (AREA_OR_POINT) are the middles of their cells.
 
 Places are metres on the ground along the raster's columns and against its rows, from the centre of
 the upper-left cell: (x, y) = (column · dx, −row · dy), dx and dy being what a cell measures on the
@@ -11,9 +10,7 @@ ellipsoid in the raster's middle. So any north-up grid serves, in degrees, feet 
 whose metres are none on the ground; :meth:`HeightRaster.to_enu` turns shifts to east and north.
 
 As LiDAR, each cell that has a height becomes a point in its middle, a record of LAS format 6 of
-class 1 (unclassified), the only return of its pulse. A raster cannot tell more: what lies under
-crowns and roofs, which cells are ground, trees or water, how many points a cell was made of, and
-where between two cells a wall stands.
+class 1 (unclassified), the only return of its pulse.
 """
 
 from __future__ import annotations

@@ -1,18 +1,10 @@
 """LiDAR files to spatially ordered point stores, and what their headers say without their points.
 
-Every point lies on one global lattice: longitude and latitude in steps of 1e-9° (0.1 mm), height in
-steps of 1e-4 m. Sums over lattice integers are exact, so that nothing later depends on the order
-of files or points. Points are stored by square cells of 2**20 steps (0.00105°, 117 m along a
-meridian), cells in row-major order (south to north, west to east), inside a cell in the order of
-the file. The store of a file is the same to the byte whatever the size of the reading chunks. Its
-files: see :mod:`.point_store`.
-
-Where a footprint is given, the store has the cells of it that the file has points in, each of them
-whole: it is the file's own store without the other cells, to the byte. A file may have no point
-there: its store has none, and the box of all its points.
-
-What ingest does to a point costs less than half of decoding it: kernels take the records apart,
-bring them to the lattice and sort them by cell without an intermediate copy of the points.
+Every point lies on one global lattice (:mod:`.lattice`). Sums over lattice integers are exact, so
+that nothing later depends on the order of files or points. Points are stored by square cells,
+cells in row-major order (south to north, west to east), inside a cell in the order of the file. The
+store of a file is the same to the byte whatever the size of the reading chunks; of a footprint, it
+is the file's own store without the other cells. Its files: see :mod:`.point_store`.
 """
 
 from __future__ import annotations
@@ -20,7 +12,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
@@ -253,15 +244,15 @@ def _refuse_coarse(points: PointFile, transform: ToWGS84) -> None:
 
 def _touching(transform: ToWGS84, footprint: Footprint | None) -> Touches | None:
     """Which boxes in a file's system may hold points of a footprint; None: all are wanted."""
-    return None if footprint is None else partial(_touch, transform, footprint)
+    if footprint is None:
+        return None
 
+    def touch(low: Floats, high: Floats) -> NDArray[np.bool_]:
+        boxes = transform.ground_boxes(low, high)
+        unknown = ~np.isfinite(boxes).all(axis=1)
+        return footprint.touches(np.where(unknown[:, None], 0.0, boxes)) | unknown
 
-def _touch(
-    transform: ToWGS84, footprint: Footprint, low: Floats, high: Floats
-) -> NDArray[np.bool_]:
-    boxes = transform.ground_boxes(low, high)
-    unknown = ~np.isfinite(boxes).all(axis=1)
-    return footprint.touches(np.where(unknown[:, None], 0.0, boxes)) | unknown
+    return touch
 
 
 @kernel

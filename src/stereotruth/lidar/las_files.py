@@ -108,7 +108,7 @@ class Packing:
 
 @dataclass
 class Layout:
-    """What a header says about the file: counts, and places in bytes from the start.
+    """Counts that a header states, and places in bytes from the file's start.
 
     Of LAZ, ``packing`` and the ``chunks``: points and bytes [n, 2].
     """

@@ -4,14 +4,12 @@ An octree keeps its points in nodes: cubes of half the side of their parent's. W
 points of a footprint follows from the octree's own cube, never from the header's bounds, which
 writers get wrong. Before any point is read, the counts of all nodes of the hierarchy must add up to
 the header's count. While points are read, each node must hold as many as the hierarchy says, all of
-them within the node's cube: else other nodes may hold points of the footprint too, and the file is
-refused.
+them within the node's cube: else other nodes may hold points of the footprint too.
 
 COPC is a LAZ file whose chunks are the nodes: its chunk table and its hierarchy tell the same by
-different ways, so that a node that one of them lacks is found without reading it. laspy's own
-reader is not asked, as its answer is cut by a box, and cannot tell whether a node keeps to its
-cube. Of Entwine Point Tiles, each node is a LAZ file of its own, and nothing but files of the
-dataset's folder is asked for. Sources: COPC 1.0 (Hobu); Entwine Point Tile 1.0 (entwine.io).
+different ways. laspy's own reader is not asked, as its answer is cut by a box, and cannot tell
+whether a node keeps to its cube. Of Entwine Point Tiles, each node is a LAZ file of its own.
+Sources: COPC 1.0 (Hobu); Entwine Point Tile 1.0 (entwine.io).
 """
 
 from __future__ import annotations

@@ -2,21 +2,15 @@
 
 Days. LAS files have either seconds of a GPS week, which tell no day, or adjusted standard GPS time:
 seconds since 1980-01-06 less 10⁹ (LAS 1.4 R16, "Global Encoding", bit 0). Days are counted from
-1970-01-01; 0 stands for none. They are those of GPS time, which is 18 s off UTC at most. A point
-store has a code of 8 bits for the day of each point, 1 + day modulo :data:`DAY_CODES`.
+1970-01-01; 0 stands for none. A point store has a code of 8 bits for the day of each point, 1 + day
+modulo :data:`DAY_CODES`.
 
-Strips of a flight are told, in this order,
-
-- by ``point_source_id``, where points of a file have more than one;
-- by GPS times of either kind, where no point was measured for a while: an aircraft turns between
-  its strips;
-- by flags of the edge of a flight line, where the points have no times and stand in the order in
-  which they were measured: two edges that follow each other are a line of pulses apart within a
-  strip, and far apart between strips.
-
-Codes follow from a point alone, so that a point has the same in any part of a file that is read:
-the ``point_source_id`` itself, or the time in steps of :data:`BIN_S`, whose runs without a gap are
-strips (:func:`runs_of`). Only the strips of edge flags are numbered within their file.
+Strips of a flight are told by ``point_source_id``, else by GPS times, where no point was measured
+for a while, else by flags of the edge of a flight line: two edges that follow each other are a line
+of pulses apart within a strip, and far apart between strips. Codes follow from a point alone, so
+that a point has the same in any part of a file that is read: the ``point_source_id`` itself, or the
+time in steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`). Only the
+strips of edge flags are numbered within their file. See docs/explanation/real_sensors.md.
 """
 
 from __future__ import annotations

@@ -40,8 +40,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
-from ..core.products.files import read_json
-from ..core.products.provenance import own_digest
+from ..core.products.files import read_record
 from .lattice import CELL_BITS, PER_DEG, PER_M, Footprint, apart, cell_key, lattice_box
 from .point_fields import Days, days_by_code
 
@@ -174,15 +173,18 @@ class PointStore:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.attrs = self._attributes()
+        self.attrs = read_record(
+            self.path / ATTRIBUTES, self._checked, what="point store", stage="ingest"
+        )
         try:
-            self.bounds: tuple[float, ...] = tuple(map(float, self.attrs["bounds"]))
-            self.count = int(self.attrs["points"]["kept"])
-            cells = self._cell_table()
-        except InputError:
-            raise
-        except (KeyError, TypeError, ValueError) as error:
-            raise self._damaged(ATTRIBUTES) from error
+            data = (self.path / CELLS).read_bytes()
+        except OSError as error:
+            raise self._damaged(CELLS) from error
+        if zlib.crc32(data) != self.attrs["cells_crc32"]:
+            raise self._damaged(CELLS)
+        cells = np.load(BytesIO(data))
+        self.bounds: tuple[float, ...] = tuple(map(float, self.attrs["bounds"]))
+        self.count = int(self.attrs["points"]["kept"])
         self.cell_row = cells["row"].astype(np.int64)
         self.cell_col = cells["col"].astype(np.int64)
         self.cell_heights = np.stack([cells["lowest"], cells["highest"]], axis=1)
@@ -193,36 +195,16 @@ class PointStore:
         self._first_of_row = np.flatnonzero(np.diff(self.cell_row, prepend=-(1 << 40)))
         self._offset = self._first_byte(POINTS, (self.count, WORDS), "<u4")
 
-    def _attributes(self) -> dict[str, Any]:
-        file = self.path / ATTRIBUTES
-        try:
-            attrs = read_json(file)
-        except FileNotFoundError as error:
+    def _checked(self, attrs: dict[str, Any]) -> dict[str, Any]:
+        if attrs["kind"] != "points":
+            raise ValueError(f"a {attrs['kind']}")
+        if attrs["format"] != FORMAT:
             raise InputError(
-                "no such point store", file=self.path, remedy="run the stage that makes it"
-            ) from error
-        except InputError as error:
-            raise self._damaged(ATTRIBUTES) from error
-        if attrs.get("kind") != "points":
-            raise InputError("no point store", file=self.path, remedy="give a store made by ingest")
-        if attrs.get("format") != FORMAT:
-            raise InputError(
-                f"a point store of format {attrs.get('format')}, not {FORMAT}",
+                f"a point store of format {attrs['format']}, not {FORMAT}",
                 file=self.path,
                 remedy="delete it and run the workflow again",
             )
-        if attrs.pop("digest", None) != own_digest(attrs):
-            raise self._damaged(ATTRIBUTES)
         return attrs
-
-    def _cell_table(self) -> NDArray[np.void]:
-        try:
-            data = (self.path / CELLS).read_bytes()
-        except OSError as error:
-            raise self._damaged(CELLS) from error
-        if zlib.crc32(data) != self.attrs["cells_crc32"]:
-            raise self._damaged(CELLS)
-        return np.load(BytesIO(data))
 
     def _first_byte(self, name: str, shape: tuple[int, ...], kind: str) -> int:
         """Where an array begins in its file, which has the size that it should have."""

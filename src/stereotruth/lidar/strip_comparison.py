@@ -1,20 +1,14 @@
 """Strips of a site's LiDAR compared where they overlap: what each is off from the others.
 
-A flight measures the ground in strips, and navigation is off by some centimetres in height and some
-decimetres in plan, otherwise in each strip. A cell of the point stores is divided into squares.
-Where the single returns of a strip in a square lie on a plane, the plane is taken; where two strips
-have one, the planes differ by
+A cell of the point stores is divided into squares. Where the single returns of a strip in a square
+lie on a plane, the plane is taken; where two strips have one, the planes differ by
 
     d = dz - g · (dx, dy),
 
 with (dx, dy, dz) the offset of the second strip from the first and g the slope of the ground or
-roof: level planes tell the offset in height, tilted ones that in plan (the measure of the quality
-of LiDAR swaths by ASPRS, "Guidelines on Geometric Inter-Swath Accuracy and Quality of Lidar Data",
-2018; Latypov 2002). One adjustment of all pairs of the site gives each strip's offset from the one
-with most ground.
-
-Points are read once, cell by cell: memory is that of a cell of 117 m, and of 128 planes for each
-two strips of a cell.
+roof (ASPRS, "Guidelines on Geometric Inter-Swath Accuracy and Quality of Lidar Data", 2018; Latypov
+2002). One adjustment of all pairs of the site gives each strip's offset from the one with most
+ground. Points are read once, cell by cell.
 """
 
 from __future__ import annotations

@@ -2,20 +2,14 @@
 
 Three things decide what a LAS coordinate means, and each is settled here or refused by name:
 the horizontal system with its unit, the unit of the heights, and the surface that the heights
-count from. Sources: LAS 1.4 R16 (ASPRS), section "Coordinate Reference System"; OGC GeoTIFF 1.1;
-PROJ's promotion of 2-D systems to 3-D.
+count from. Sources: LAS 1.4 R16 (ASPRS), section "Coordinate Reference System"; OGC GeoTIFF 1.1.
 
-- The file's own declaration wins over ``lidar_crs``, which serves files that declare none, or
-  supplies the vertical part where a file declares the same horizontal system only.
-- Heights without a unit of their own are in the unit of a projected horizontal system (the custom
-  of LAS), in metres in a geographic one.
-- Orthometric heights H need a geoid grid: h = H + N. Nothing is ever downloaded.
+- Orthometric heights H need a geoid grid: h = H + N. It counts from the frame of the file, so that
+  it comes before the change of frame. Nothing is ever downloaded.
 - Heights whose surface is declared nowhere are orthometric if a geoid is given, else ellipsoidal;
   but a file whose name carries the name of a vertical datum (``..._IGN69.laz``) needs the geoid.
 - Map projections are undone by polynomials that are checked against PROJ (:mod:`.smooth_maps`); a
   coordinate may come out one step of 1e-9 degree beside PROJ's.
-- Frames that are known to centimetres go to ITRF2020 at the date of the images (:mod:`.frames`):
-  WGS 84 as RPCs mean it. Geoid grids count from the frame of the file, so that they come first.
 - Which datum transformation is best depends on the place: on the whole degrees of longitude and
   latitude that the points' own extent touches, whatever box the header states.
 """

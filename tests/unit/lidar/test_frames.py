@@ -109,7 +109,10 @@ def at(year: float) -> Epochs:
 NEW_ZEALAND = [f"{ITRF96_AT_2000} +step {plate(name, 2000)}" for name in ("AUST", "PCFC")]
 COUNTRIES = [  # system, place, epoch of the images, PROJ's steps, metres in plan and up
     ("Jacksonville", 6346, (-81.66, 30.33), 2020.0, NAD83, (0.95, -1.48)),
+    ("Seattle", 6339, (-122.3, 47.6), 2020.0, NAD83, (1.51, -0.32)),
     ("Vancouver", 3157, (-123.1, 49.25), 2023.4, NAD83, None),  # NAD83(CSRS) without a version
+    ("Toronto", 22817, (-79.4, 43.7), 2018.0, NAD83, None),  # NAD83(CSRS)v8
+    ("Florida, NAD83", 26917, (-81.66, 30.33), 2020.0, NAD83, None),
     ("Sydney", 7856, (151.2, -33.9), 2026.0, GDA2020, (0.34, 0.0)),
     ("Paris, RGF93 v1", 2154, (2.35, 48.85), 2020.0, ETRF2020, (0.74, 0.0)),
     ("Paris, RGF93 v2b", 9794, (2.35, 48.85), 2020.0, ETRF2000, None),
