@@ -222,8 +222,7 @@ class Candidate:
 
 def _every_candidate(lon: float, lat: float) -> list[Candidate]:
     """The geoids of a place, those of least ground first, each with a grid that is here if any."""
-    folders = pyproj.datadir.get_data_dir().split(os.pathsep)
-    file = Path(folders[0]) / "proj.db"
+    file = Path(pyproj.datadir.get_data_dir().split(os.pathsep)[0]) / "proj.db"
     try:
         with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True)) as register:
             rows = register.execute(QUERY, {"lon": float(turn(lon)), "lat": lat}).fetchall()
@@ -232,14 +231,18 @@ def _every_candidate(lon: float, lat: float) -> list[Candidate]:
     surfaces: dict[str, list[tuple[float, str]]] = {}
     for surface, grid, _, accuracy_m in rows:
         surfaces.setdefault(surface, []).append((accuracy_m, grid))
-    folders.append(pyproj.datadir.get_user_data_dir())
     candidates = []
     for surface, ranked in surfaces.items():
         grids = [grid for _, grid in sorted(ranked, key=lambda one: one[0])]
-        here = ((grid, Path(folder) / grid) for grid in grids for folder in folders)
-        grid, path = next(((g, p) for g, p in here if p.is_file()), (grids[0], None))
-        candidates.append(Candidate(surface, grid, path))
+        here = ((grid, path) for grid in grids if (path := _installed(grid)) is not None)
+        candidates.append(Candidate(surface, *next(here, (grids[0], None))))
     return candidates
+
+
+def _installed(grid: str) -> Path | None:
+    """Where a grid lies among PROJ's data."""
+    folders = [*pyproj.datadir.get_data_dir().split(os.pathsep), pyproj.datadir.get_user_data_dir()]
+    return next((p for folder in folders if (p := Path(folder) / grid).is_file()), None)
 
 
 def candidates_at(lon: float, lat: float) -> list[Candidate]:
