@@ -11,7 +11,6 @@ import pytest
 import shapely
 
 from stereotruth.core.errors import InputError
-from stereotruth.lidar import catalogue
 from stereotruth.lidar.catalogue import Tile, cover_of, read_catalogue, resolved
 from stereotruth.lidar.lattice import CELL_DEG, Footprint
 
@@ -174,12 +173,6 @@ def test_a_damaged_catalogue_is_refused(tmp_path, fault):
     with pytest.raises(InputError) as error:
         read(tmp_path, DAMAGED[fault])
     assert error.value.file.endswith("tiles.json") and error.value.remedy
-
-
-def test_a_catalogue_that_is_too_large_is_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(catalogue, "MOST_BYTES", 10)
-    with pytest.raises(InputError, match="larger"):
-        read(tmp_path, item(0))
 
 
 WEB, DISK = "https://data.example.org/lidar/index.json", "lidar/tiles.vpc"

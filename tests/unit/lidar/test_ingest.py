@@ -147,13 +147,6 @@ def test_noise_and_withheld_points_are_dropped_and_counted(tmp_path, pdrf) -> No
     assert kept["points"]["kept"] == 890
 
 
-def test_places_off_the_earth(tmp_path) -> None:
-    xyz = np.random.default_rng(0).uniform(0, 100, (1000, 3))
-    xyz += [3e8, 3e8, 0]
-    write_las(tmp_path / "a.laz", xyz=xyz, scale=0.01)
-    refused(tmp_path / "a.laz", "1000 points have no place on Earth")
-
-
 def test_coarse_and_quantised_coordinates(tmp_path) -> None:
     xyz = np.random.default_rng(0).uniform(0, 0.1, (2000, 3))
     xyz += [114, 30, 0]

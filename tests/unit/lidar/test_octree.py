@@ -91,17 +91,6 @@ def read(path: str | Path, ground: Ground | None) -> np.ndarray:
 # ------------------------------------------------------------------ COPC
 
 
-def test_a_footprint_has_the_points_of_the_whole_file(made):
-    """On a server, for boxes anywhere."""
-    rng = np.random.default_rng(5)
-    with serving(made.content) as server:
-        place = server.stand_in(content="")
-        for _ in range(5):
-            low = CORNER[:2] + rng.uniform(-300, 2048, 2)
-            ground = Ground(low, low + rng.uniform(1, 500, 2))
-            assert np.array_equal(read(place, ground), cropped(made.content, ground))
-
-
 @pytest.mark.parametrize("name", ["simple_with_page.copc.laz", "autzen.copc.laz"])
 def test_files_of_other_software_are_read_whole(name):
     file = SHARED / "lidar" / name
@@ -325,20 +314,3 @@ def test_a_damaged_dataset_is_refused_and_a_footprint_of_it_whole(dataset, good,
     except InputError:
         return
     assert content_of(PointStore("part.points")) == good["part"]
-
-
-def test_nodes_of_a_server_are_those_of_the_disk_and_asked_for_once(dataset, good):
-    with serving(dataset.parent) as server:
-        place = server.stand_in("ept.json", "Tue, 24 Nov 2026 10:00:00 GMT")
-        with pytest.raises(InputError, match="changed on its server"):
-            open_octree(place)
-        place = server.stand_in("ept.json")
-        server.requests.clear()
-        ingest(place, "web.points", footprint=ground())
-        nodes = [one for one in server.requests if "ept-data" in one]
-        assert len(nodes) == len(set(nodes)) == PointStore("web.points").attrs["nodes"][0]
-        server.requests.clear()
-        ingest(place, "again.points", footprint=ground())
-        assert server.requests == []
-    for name in ("web", "again"):
-        assert content_of(PointStore(f"{name}.points")) == good["part"]

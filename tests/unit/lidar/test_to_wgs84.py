@@ -9,7 +9,7 @@ import pytest
 from stereotruth.core.errors import InputError
 from stereotruth.lidar import declared_crs, to_wgs84
 
-from ...synthetic.las import FT, NAVD88_FTUS, US_FT, UTM_10, header_of, write_gtx
+from ...synthetic.las import FT, UTM_10, header_of, write_gtx
 
 X, Y, Z = np.array([400_000.0]), np.array([300_000.0]), np.array([120.0])  # Oregon, metres
 LOW = (399_950, 299_950, 0)
@@ -29,20 +29,6 @@ def test_feet_and_metres_are_the_same_place(code, unit) -> None:
     np.testing.assert_allclose(height, Z, atol=1e-6)
     assert any("no vertical datum" in note for note in transform.notes)
     assert transform.describe()["height_unit_m"] == pytest.approx(unit)
-
-
-def test_compound_of_metres_and_survey_feet_with_a_geoid(tmp_path) -> None:
-    geoid = write_gtx(tmp_path / "g.gtx", np.full((31, 31), -22.5), -122.0, 43.0, 0.1)
-    horizontal = pyproj.CRS("EPSG:2991").to_wkt("WKT1_GDAL")
-    header = header_of(f'COMPD_CS["c",{horizontal},{NAVD88_FTUS}]', low=LOW)
-    with pytest.raises(InputError, match=r"NAVD88.*geoid") as refused:
-        to_wgs84.to_wgs84(header, "bmx.las")
-    assert "bmx.las" in str(refused.value)
-    transform = to_wgs84.to_wgs84(header, "bmx.las", geoid=geoid)
-    lon, lat, height = transform(X, Y, Z / US_FT)
-    np.testing.assert_allclose([lon, lat], oregon_truth(), rtol=0, atol=2e-9)
-    np.testing.assert_allclose(height, Z - 22.5, atol=1e-5)
-    assert transform.describe()["geoid"] == "g.gtx"
 
 
 def test_declared_ellipsoidal_heights_take_no_geoid(tmp_path) -> None:
