@@ -71,7 +71,6 @@ class Tile:
 class Catalogue:
     """A catalogue and its tiles; ``bytes`` and ``sha256`` are those of its file."""
 
-    location: str
     bytes: int
     sha256: str
     tiles: tuple[Tile, ...] = field(repr=False)
@@ -107,7 +106,7 @@ def read_catalogue(
         raise InputError("a catalogue without a tile", file=location, remedy="check its content")
     if len(tiles) > MOST_TILES:
         raise InputError(f"more than {MOST_TILES} tiles", file=location, remedy=CUT)
-    return Catalogue(location, len(content), hashlib.sha256(content).hexdigest(), tuple(tiles))
+    return Catalogue(len(content), hashlib.sha256(content).hexdigest(), tuple(tiles))
 
 
 def _of_json(

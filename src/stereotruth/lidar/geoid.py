@@ -37,7 +37,6 @@ ROUGH = 0.01  # share of neighbouring nodes that are steeper: heights of ground
 SLACK = 1e-6  # of the step between nodes, against rounding at the outermost
 LEAST_SPREAD_M, WIDE_DEG = 3.0, 5.0  # undulations of any part of the Earth so wide differ by more
 MOST = 4  # candidates beside the ellipsoid
-ASSUMED = "ellipsoidal (assumed)"  # how stores say that nothing is declared
 QUERY = """
 SELECT v.name, a.proj_grid_name,
        MIN((e.north_lat - e.south_lat)

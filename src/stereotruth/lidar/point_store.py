@@ -50,6 +50,7 @@ Words = NDArray[np.uint32]
 
 
 FORMAT = 5  # of the files
+ASSUMED = "ellipsoidal (assumed)"  # of heights that nothing declares
 POINTS, CELLS, STRIPS, ATTRIBUTES = "points.npy", "cells.npy", "strips.npy", "store.json"
 SQUARES = 16  # of a cell along each side, that its points are counted by
 WORDS = 3  # of 32 bits, of a point
@@ -237,6 +238,11 @@ class PointStore:
     def days(self) -> Days:
         """The day that each code of a point stands for [256]; 0: not known."""
         return days_by_code(self.attrs["days"], self.attrs["acquired"])
+
+    @property
+    def has_assumed_heights(self) -> bool:
+        """Whether nothing declares what the heights of its file count from."""
+        return str(self.attrs["crs"]["heights"]).startswith(ASSUMED)
 
     @property
     def cell_counts(self) -> Integers:

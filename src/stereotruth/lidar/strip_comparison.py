@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from ..core.numerics.degrees import DEGREE_M, exact_metres_per_degree
-from ..core.numerics.robust import TUKEY, robust_sigma, tukey_weights
+from ..core.numerics.robust import robust_sigma, tukey_weights
 from .lattice import CELL_BITS, CELL_DEG, LATTICE_DEG, LATTICE_M
 from .point_fields import BIN_S, EDGES, SOURCE, TIME, runs_of
 from .point_store import SQUARES as CELL_SQUARES
@@ -288,11 +288,10 @@ def compare(first: Planes, second: Planes, squares: int, cell: int) -> Differenc
 
 class Offset(NamedTuple):
     """Offset of a strip from another, east, north, up (m), with its covariance [3, 3] (m²), from so
-    many planes in so many ``groups`` of planes nearby."""
+    many ``groups`` of planes nearby."""
 
     value: Floats
     covariance: Floats
-    planes: int
     groups: int
 
     @property
@@ -336,8 +335,7 @@ def offset_of(parts: list[Differences]) -> Offset | None:
     groups = np.stack([np.bincount(which, scores[:, k]) for k in range(3)], axis=1)
     inverse = np.linalg.inv(corrected)
     meat = groups.T @ groups * len(groups) / (len(groups) - 3) + prior
-    used = np.abs(residual / np.sqrt(spread) / scale) < TUKEY
-    return Offset(value, inverse @ meat @ inverse, int(used.sum()), len(groups))
+    return Offset(value, inverse @ meat @ inverse, len(groups))
 
 
 def _adjusted(
