@@ -45,7 +45,7 @@ from stereotruth.evaluate.epipolar_truth import write_grid_truth
 from stereotruth.lidar.frames import Epoch, Epochs
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
-from stereotruth.lidar.strip_moves import move_strips
+from stereotruth.lidar.strips import move_strips
 from stereotruth.lidar.to_wgs84 import to_wgs84
 from stereotruth.project.simulated_project import DEMO
 

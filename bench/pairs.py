@@ -28,8 +28,8 @@ from stereocities.sites import SiteSpec, drawn_site
 from stereotruth.core.products.grids import open_grid
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rectify import rectify
+from stereotruth.lidar.point_statistics import roughness_m
 from stereotruth.lidar.point_store import open_stores
-from stereotruth.lidar.roughness import roughness_m
 from stereotruth.sensor.image_reader import open_pair
 from stereotruth.sensor.pair_quality import USUAL_ROUGHNESS_M, quality_of
 from stereotruth.sensor.rpc import SensorModel

@@ -109,20 +109,14 @@ def _in_feet(folder: Path) -> None:
 
 FAULTS = {
     "ept.json cut": lambda f: (f / "ept.json").write_bytes((f / "ept.json").read_bytes()[:90]),
-    "ept.json a list": lambda f: (f / "ept.json").write_text("[]"),
     "ept.json nested": lambda f: (f / "ept.json").write_text("[" * 99999),
     "no bounds": lambda f: _about(f, bounds=None),
-    "bounds no numbers": lambda f: _about(f, bounds=["a"] * 6),
     "bounds no cube": lambda f: _about(f, bounds=[0, 0, 0, 1, 2, 3]),
-    "bounds infinite": lambda f: _about(f, bounds=[0, 0, 0, 1e999, 1, 1]),
     "cube shifted": lambda f: _about(f, bounds=[9e5, 9e5, 0, 9e5 + 2048, 9e5 + 2048, 2048]),
     "cube too small": lambda f: _about(f, bounds=[*CORNER.tolist(), *(CORNER + 1000.0).tolist()]),
     "binary points": lambda f: _about(f, dataType="binary"),
     "other count": lambda f: _about(f, points=6001),
-    "count no number": lambda f: _about(f, points="many"),
-    "hierarchy lacks": lambda f: (f / "ept-hierarchy" / "0-0-0-0.json").unlink(),
     "branch lacks": lambda f: _branch(f).unlink(),
-    "branch cut": lambda f: _branch(f).write_bytes(_branch(f).read_bytes()[:20]),
     "branch empty": lambda f: _branch(f).write_text("{}"),
     "branch named twice": lambda f: _page(
         f, lambda p: p.update({_branch(f, 1).stem: -1}), _branch(f).stem
@@ -131,18 +125,10 @@ FAULTS = {
     "node counted otherwise": lambda f: _page(f, lambda p: p.update({"0-0-0-0": 7})),
     "key of another octree": lambda f: _page(f, lambda p: p.update({"1-5-0-0": 3})),
     "key that climbs": lambda f: _page(f, lambda p: p.update({"../../../etc/passwd": -1})),
-    "key with a host": lambda f: _page(f, lambda p: p.update({"//evil.example/x": -1})),
-    "count that is a text": lambda f: _page(f, lambda p: p.update({"0-0-0-0": "9"})),
     "count a truth value": lambda f: _page(f, lambda p: p.update({"0-0-0-0": True})),
     "root that leads to itself": lambda f: _page(f, lambda p: p.update({"0-0-0-0": -1})),
-    "page without its own node": lambda f: _page(
-        f, lambda p: p.pop(_branch(f).stem), _branch(f).stem
-    ),
-    "negative count": lambda f: _page(f, lambda p: p.update({"0-0-0-0": -7})),
-    "digits of another script": lambda f: _page(f, lambda p: p.update({"1-0-0-\u0663": 0})),
     "node lacks": lambda f: _some_node(f).unlink(),
     "node cut": lambda f: _some_node(f).write_bytes(_some_node(f).read_bytes()[:-300]),
-    "node empty": lambda f: _some_node(f).write_bytes(b""),
     "node no LAZ": lambda f: _some_node(f).write_bytes(b"x" * 5000),
     "node of other scales": _other_scale,
     "node in feet": _in_feet,

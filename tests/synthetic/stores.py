@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.lattice import Footprint
 from stereotruth.lidar.point_store import PointStore
 
 

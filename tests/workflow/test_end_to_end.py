@@ -95,7 +95,7 @@ EDITED = {
     "stereotruth/align/align": STAGES,
     "stereotruth/surface/facets": {"surface", "project", "export"},
     "stereotruth/lidar/ingest": STAGES - {"align"} | {"ingest", "compare_strips", "surface"},
-    "stereotruth/lidar/strip_planes": {"compare_strips", "project", "export"},
+    "stereotruth/lidar/strip_comparison": {"compare_strips", "project", "export"},
     "stereotruth/core/sheets stereocities/render": set(),
 }
 

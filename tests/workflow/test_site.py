@@ -18,7 +18,7 @@ import rasterio
 from stereocities.site_images import image_truth
 from stereotruth.core.products.grids import open_grid
 from stereotruth.lidar.catalogue_list import ListedTile, TileList, write_list
-from stereotruth.lidar.footprint import Footprint
+from stereotruth.lidar.lattice import Footprint
 from stereotruth.project.simulated_project import SITE
 from stereotruth.tiles.verify import defects
 

@@ -73,7 +73,7 @@ rule report_site:
         code=source_digest(
             "stereotruth.evaluate.report.site_page",
             "stereotruth.align.site_images",
-            "stereotruth.lidar.roughness",
+            "stereotruth.lidar.point_statistics",
         ),
         templates=templates_of("stereotruth/evaluate/report/site_page.html.jinja"),
     message:

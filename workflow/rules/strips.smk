@@ -42,7 +42,7 @@ rule move_strips:
         runtime=60,
     params:
         sources=upstream("move_strips"),
-        code=source_digest("stereotruth.lidar.strip_moves"),
+        code=source_digest("stereotruth.lidar.strips"),
     message:
         "Moving the points of {wildcards.lidar} by the offsets of their strips"
     script:

@@ -3,8 +3,7 @@
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, digest
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.lidar.strip_moves import move_strips
-from stereotruth.lidar.strip_offsets import RECORD, StripOffsets
+from stereotruth.lidar.strips import RECORD, StripOffsets, move_strips
 
 if __name__ == "__main__":
     points, strips = snakemake.input.points, snakemake.input.strips

@@ -132,9 +132,9 @@ def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pix
     best = int(np.argmax(counts))
     near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
     shift = float(np.median([np.median(d) for d in near if d.size]))
-    from ..lidar.geoid_candidates import ASSUMED, fits  # PROJ, which few refinements need
+    from ..lidar.geoid import fits  # PROJ, which few refinements need
 
-    declared = not any(s.attrs["crs"]["heights"].startswith(ASSUMED) for s in stores)
+    declared = not any(store.has_assumed_heights for store in stores)
     place = [float(np.median([getattr(gcp, name) for gcp in gcps])) for name in ("lon", "lat")]
     cause = (
         f"{counts[best]} would if it were {abs(shift):.1f} m "

@@ -19,7 +19,7 @@ from rasterio.errors import RasterioError
 from ..core.errors import InputError
 from ..core.numerics.geometry import corners_of_hull
 from ..core.products.rasters import open_raster
-from ..lidar.footprint import Footprint
+from ..lidar.lattice import Footprint
 from ..sensor.pair_geometry import find_overlap, find_rotation
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import read_rpc

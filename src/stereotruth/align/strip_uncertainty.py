@@ -18,7 +18,7 @@ from ..core.numerics.geometry import exact_metres_per_degree
 from ..epipolar.model import EpipolarModel
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, cell_key
 from ..lidar.point_store import SQUARES
-from ..lidar.strip_offsets import StripOffsets
+from ..lidar.strips import StripOffsets
 from .label_uncertainty import _UPPER, STEP, LabelUncertainty
 
 Floats = NDArray[np.float64]

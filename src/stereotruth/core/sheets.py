@@ -21,7 +21,6 @@ from pydantic.dataclasses import dataclass
 
 from .config.section import (
     CHECKED,
-    LONGEST_NAME,
     PATTERN,
     REPEATED,
     FilePath,
@@ -32,6 +31,7 @@ from .config.section import (
     name_of,
 )
 from .errors import InputError, did_you_mean
+from .products.files import LONGEST_NAME
 from .tables import Mistakes, Table, acquisition_time, epoch_year, require_unique
 
 MOST_SCENES = 2000  # Snakemake takes 20 ms of a plan for each: 40 s

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.numerics.geometry import corners_of_hull
 from ..epipolar.model import EpipolarModel
-from ..lidar.footprint import CELL_DEG, Footprint
-from ..lidar.lattice import cell_key
+from ..lidar.lattice import CELL_DEG, Footprint, cell_key
 from ..lidar.point_store import PointStore
 from ..sensor.virtual_points import frame, inside
 from .scene_inputs import SceneInputs

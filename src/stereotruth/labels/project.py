@@ -31,7 +31,7 @@ from ..core.products.provenance import checksums, describe, digest
 from ..core.products.resumable_grids import BlockStore, resumable_grid
 from ..core.status import Status, carries_label, is_labelled
 from ..epipolar.model import EpipolarModel
-from ..lidar.overlap_check import apart, refuse_apart
+from ..lidar.lattice import apart, refuse_apart
 from .change_evidence import Evidence
 from .image_patches import MaskedImage
 from .layers import layers

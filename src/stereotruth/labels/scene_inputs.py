@@ -23,10 +23,10 @@ from ..core.status import Status, statuses_of
 from ..core.tables import acquisition_time
 from ..epipolar.image_noise import NoiseCurve, pair_noise
 from ..epipolar.model import EpipolarModel
-from ..lidar.density import points_per_m2
 from ..lidar.lattice import LATTICE_DEG
+from ..lidar.point_statistics import points_per_m2
 from ..lidar.point_store import PointStore, open_stores
-from ..lidar.strip_offsets import StripOffsets
+from ..lidar.strips import StripOffsets
 from ..sensor.acquisition import Acquisition, by_sheet
 from ..sensor.pair_light import PairLight, pair_light
 from ..sensor.rpc import RPC

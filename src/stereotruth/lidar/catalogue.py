@@ -33,7 +33,7 @@ from ..core.products.remote_files import SCHEMES, is_remote, read_bytes
 from ..core.sheets import LIDAR_SEPARATOR, LIDAR_SUFFIXES, RASTER_SUFFIXES
 from .catalogue_list import EPT
 from .declared_crs import interpret
-from .footprint import CELL_DEG, Footprint
+from .lattice import CELL_DEG, Footprint
 
 MOST_BYTES = 200_000_000  # of a catalogue
 MOST_TILES = 1_000_000
@@ -41,6 +41,7 @@ TILE_SUFFIXES = (*LIDAR_SUFFIXES, *RASTER_SUFFIXES, EPT)
 ELSEWHERE = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:|//|\\\\")  # a scheme, or another host
 NO_DATA_ROLES = {"overview", "thumbnail", "metadata", "visual"}
 KINDS = "give a VPC, STAC items, GeoJSON or GeoPackage; see that the file is whole"
+CUT = "cut it to the region"
 FARTHEST = 1e9  # coordinate, in metres or feet
 SIDE_PARTS = 8  # of an outline in a projection, whose sides are not straight in degrees
 JOINT_DEG = 1e-5  # by which outlines of neighbours may miss each other: a metre
@@ -70,7 +71,6 @@ class Tile:
 class Catalogue:
     """A catalogue and its tiles; ``bytes`` and ``sha256`` are those of its file."""
 
-    location: str
     bytes: int
     sha256: str
     tiles: tuple[Tile, ...] = field(repr=False)
@@ -94,11 +94,8 @@ def read_catalogue(
     elif not (file := Path(location)).is_file():
         raise InputError("no such catalogue", file=file, remedy="correct its path")
     elif file.stat().st_size > MOST_BYTES:
-        raise InputError(
-            f"a catalogue larger than {MOST_BYTES / 1e6:g} MB",
-            file=file,
-            remedy="cut it to the region",
-        )
+        problem = f"a catalogue larger than {MOST_BYTES / 1e6:g} MB"
+        raise InputError(problem, file=file, remedy=CUT)
     else:
         content = file.read_bytes()
     if content[:15] == b"SQLite format 3":
@@ -108,10 +105,8 @@ def read_catalogue(
     if not tiles:
         raise InputError("a catalogue without a tile", file=location, remedy="check its content")
     if len(tiles) > MOST_TILES:
-        raise InputError(
-            f"more than {MOST_TILES} tiles", file=location, remedy="cut it to the region"
-        )
-    return Catalogue(location, len(content), hashlib.sha256(content).hexdigest(), tuple(tiles))
+        raise InputError(f"more than {MOST_TILES} tiles", file=location, remedy=CUT)
+    return Catalogue(len(content), hashlib.sha256(content).hexdigest(), tuple(tiles))
 
 
 def _of_json(
@@ -120,9 +115,8 @@ def _of_json(
     try:
         read = json.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"no catalogue that can be read ({type(error).__name__})", file=location, remedy=KINDS
-        ) from None
+        problem = f"no catalogue that can be read ({type(error).__name__})"
+        raise InputError(problem, file=location, remedy=KINDS) from None
     kind = read.get("type") if isinstance(read, Mapping) else None
     if kind in ("Catalog", "Collection"):
         raise InputError(
@@ -133,10 +127,9 @@ def _of_json(
     features = read.get("features") if kind == "FeatureCollection" else [read]
     if kind not in ("FeatureCollection", "Feature") or not isinstance(features, list):
         raise InputError("neither STAC items nor GeoJSON", file=location, remedy=KINDS)
-    links = read.get("links")
-    linked = links if isinstance(links, list) else []
-    more = any(isinstance(link, Mapping) and link.get("rel") == "next" for link in linked)
-    matched = read.get("numberMatched")
+    links, matched = read.get("links"), read.get("numberMatched")
+    linked = map(_mapping, links if isinstance(links, list) else ())
+    more = any(link.get("rel") == "next" for link in linked)
     if more or (isinstance(matched, int) and matched > len(features)):
         raise InputError(
             f"a page of {len(features)} items of a search that has found more",
@@ -144,16 +137,15 @@ def _of_json(
             remedy="save all of its pages in one file",
         )
     for number, feature in enumerate(features, 1):
-        if not isinstance(feature, Mapping) or feature.get("type") != "Feature":
+        if _mapping(feature).get("type") != "Feature":
             raise _damaged(location, number, "is no feature")
     if any("assets" in feature for feature in features):
-        dated = not location.lower().endswith(".vpc")  # which has days of writing there
-        return [_item(item, n, location, dated) for n, item in enumerate(features, 1)]
-    named = read.get("crs")
+        is_dated = not location.lower().endswith(".vpc")  # which has days of writing there
+        return [_item(item, n, location, is_dated) for n, item in enumerate(features, 1)]
     crs = None
-    if isinstance(named, Mapping):  # of GeoJSON 2008, as GDAL writes it
+    if isinstance(read.get("crs"), Mapping):  # of GeoJSON 2008, as GDAL writes it
         try:
-            crs = CRS.from_user_input(named["properties"]["name"])
+            crs = CRS.from_user_input(read["crs"]["properties"]["name"])
         except (KeyError, TypeError, CRSError, ValueError):
             raise _no_system(location) from None
     rows = (
@@ -212,11 +204,16 @@ def _rows_of_geopackage(content: bytes, location: str) -> Iterable[Row]:
     return zip(table.drop(columns=table.geometry.name).to_dict("records"), outlines)
 
 
-def _item(item: Mapping[str, Any], number: int, location: str, dated: bool) -> Tile:
+def _item(item: Mapping[str, Any], number: int, location: str, is_dated: bool) -> Tile:
     """A tile of a STAC item; its own coordinates come before degrees, as VPC has it."""
     properties = _mapping(item.get("properties"))
-    crs = _projection(properties)
-    outline = None
+    crs = outline = None
+    for key in ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg"):
+        if crs is None and (value := properties.get(key)):
+            try:
+                crs = CRS.from_user_input(value)
+            except (CRSError, TypeError, ValueError):
+                continue
     if crs is not None:
         outline = _outline(properties.get("proj:geometry"), crs)
         outline = outline or _boxed(properties.get("proj:bbox"), crs)
@@ -224,7 +221,7 @@ def _item(item: Mapping[str, Any], number: int, location: str, dated: bool) -> T
     if outline is None:
         raise _damaged(location, number, "has no outline that can be read")
     first, last = properties.get("start_datetime"), properties.get("end_datetime")
-    if dated and not (first and last):
+    if is_dated and not (first and last):
         first = last = properties.get("datetime")
     points = properties.get("pc:count")
     return Tile(
@@ -237,24 +234,13 @@ def _item(item: Mapping[str, Any], number: int, location: str, dated: bool) -> T
     )
 
 
-def _projection(properties: Mapping[str, Any]) -> CRS | None:
-    """The system that a STAC item declares (proj:wkt2, proj:projjson, proj:code, proj:epsg)."""
-    for key in ("proj:wkt2", "proj:projjson", "proj:code", "proj:epsg"):
-        if value := properties.get(key):
-            try:
-                return CRS.from_user_input(value)
-            except (CRSError, TypeError, ValueError):
-                continue
-    return None
-
-
 def _asset(assets: Any, number: int, location: str) -> str:
     """The location of an item's points: the one asset with data."""
     held = []
     for asset in map(_mapping, _mapping(assets).values()):
         href, roles = asset.get("href"), asset.get("roles")
-        without = isinstance(roles, list) and NO_DATA_ROLES & set(map(str, roles))
-        if isinstance(href, str) and not without:
+        is_other = isinstance(roles, list) and NO_DATA_ROLES & set(map(str, roles))
+        if isinstance(href, str) and not is_other:
             held.append(href)
     for kind in (LIDAR_SUFFIXES, (EPT,), RASTER_SUFFIXES):
         if fitting := [href for href in held if _path(href).endswith(kind)]:
@@ -279,24 +265,33 @@ def _day(value: Any) -> str:
     """The UTC date of a time, or empty."""
     try:
         time = datetime.fromisoformat(str(value).strip())
-        time = time if time.tzinfo is None else time.astimezone(UTC)
+        return (time if time.tzinfo is None else time.astimezone(UTC)).date().isoformat()
     except (ValueError, OverflowError):  # none, or of the year 0
         return ""
-    return time.date().isoformat()
 
 
 def _indexed(
     rows: Iterable[Row], column: str, dates: tuple[str, str] | None, location: str
 ) -> list[Tile]:
-    """Tiles of an index: the locations stand in a column."""
+    """Tiles of an index: the locations stand in a column, the one whose texts all name files."""
     held = list(rows)
-    column = column or _location_column([row for row, _ in held], location)
+    names = list(map(str, held[0][0])) if held else []
+    if held and not column:
+        fitting = [name for name in names if all(_is_tile(row.get(name)) for row, _ in held)]
+        if len(fitting) != 1:
+            several = f"{len(fitting)} columns" if fitting else "no column"
+            raise InputError(
+                f"{several} whose every value names a LAS, LAZ, COPC, EPT or GeoTIFF file",
+                file=location,
+                remedy=f"name it by --column; there are {', '.join(fitting or names) or 'none'}",
+            )
+        column = fitting[0]
     missing = {name for name in (column, *(dates or ())) if all(name not in row for row, _ in held)}
     if held and missing:
         raise InputError(
             f"has no column {min(missing)!r}",
             file=location,
-            remedy=f"its columns are {', '.join(map(str, held[0][0])) or 'none'}",
+            remedy=f"its columns are {', '.join(names) or 'none'}",
         )
     tiles = []
     for number, (row, outline) in enumerate(held, 1):
@@ -310,26 +305,8 @@ def _indexed(
     return tiles
 
 
-def _location_column(rows: list[Mapping[str, Any]], location: str) -> str:
-    """The one column whose texts all name files of points or of surface models."""
-    names = list(rows[0]) if rows else []
-
-    def fits(name: str) -> bool:
-        values = [row.get(name) for row in rows]
-        return all(
-            isinstance(value, str) and _path(value).endswith(TILE_SUFFIXES) for value in values
-        )
-
-    fitting = [name for name in names if fits(name)]
-    if rows and len(fitting) != 1:
-        several = f"{len(fitting)} columns" if fitting else "no column"
-        there = ", ".join(map(str, fitting or names)) or "none"
-        raise InputError(
-            f"{several} whose every value names a LAS, LAZ, COPC, EPT or GeoTIFF file",
-            file=location,
-            remedy=f"name it by --column; there are {there}",
-        )
-    return fitting[0] if fitting else ""
+def _is_tile(value: Any) -> bool:
+    return isinstance(value, str) and _path(value).endswith(TILE_SUFFIXES)
 
 
 # ---------------------------------------------------------------------------------------- outlines
@@ -351,9 +328,9 @@ def _boxed(box: Any, crs: CRS | None) -> Geometry | None:
         (west, south), (east, north) = values
     except (TypeError, ValueError, OverflowError):
         return None
-    sides = [(west, east)] if crs is not None or west <= east else [(west, 180.0), (-180.0, east)]
     if not np.isfinite(values).all():
         return None
+    sides = [(west, east)] if crs is not None or west <= east else [(west, 180.0), (-180.0, east)]
     parts = [shapely.box(first, south, last, north) for first, last in sides]
     return _in_degrees(shapely.multipolygons(parts), crs)
 
@@ -387,13 +364,10 @@ def _in_degrees(outline: Geometry | None, crs: CRS | None) -> Geometry | None:
         else shapely.transform(part, lambda xy: np.stack([continuous(xy[:, 0]), xy[:, 1]], axis=1))
         for part in shapely.get_parts(outline)
     ]
-    found = shapely.make_valid(
+    valid = shapely.make_valid(
         shapely.multipolygons(parts), method="structure", keep_collapsed=False
     )
-    return None if found.is_empty else found
-
-
-# ------------------------------------------------------------------------------------------- cover
+    return None if valid.is_empty else valid
 
 
 @dataclass(frozen=True)
@@ -436,14 +410,8 @@ def cover_of(tiles: Sequence[Tile], footprint: Footprint) -> Cover:
     common = shapely.area(shapely.intersection(own[one], own[other]))
     least = np.minimum(shapely.area(own[one]), shapely.area(own[other]))
     same = (common > 0) & (common >= DOUBLED_SHARE * least)
-    doubled = np.stack([taken[one[same]], taken[other[same]]], axis=1)
-    return Cover(
-        tuple(taken.tolist()),
-        footprint.area_m2,
-        hole_m2,
-        hole_at,
-        tuple((a, b) for a, b in doubled[np.lexsort(doubled.T[::-1])].tolist()),
-    )
+    doubled = sorted(zip(taken[one[same]].tolist(), taken[other[same]].tolist()))
+    return Cover(tuple(taken.tolist()), footprint.area_m2, hole_m2, hole_at, tuple(doubled))
 
 
 # --------------------------------------------------------------------------------------- locations
@@ -456,10 +424,13 @@ def resolved(href: str, catalogue: str, hosts: frozenset[str]) -> str:
     unless ``hosts`` has it, ``file:`` and other schemes, http where the catalogue came by https; of
     a catalogue on the disk, any host but those of ``hosts``.
     """
+
+    def untrusted(where: str, remedy: str) -> InputError:
+        return InputError(f"a tile of it leads to {where}", file=catalogue, remedy=remedy)
+
     if not href.isprintable() or LIDAR_SEPARATOR in href:
-        raise _untrusted(
-            catalogue, "a name that no sheet can have", f"name no file with {LIDAR_SEPARATOR!r}"
-        )
+        remedy = f"name no file with {LIDAR_SEPARATOR!r}"
+        raise untrusted("a name that no sheet can have", remedy)
     if not is_remote(catalogue) and not ELSEWHERE.match(href):
         return str(Path(catalogue).parent / href)
     try:
@@ -467,20 +438,17 @@ def resolved(href: str, catalogue: str, hosts: frozenset[str]) -> str:
         new, old = urlsplit(target), urlsplit(catalogue if is_remote(catalogue) else "")
         origin = new.scheme, new.hostname, new.port
     except ValueError:
-        raise _untrusted(catalogue, "what is no URL", "correct the catalogue") from None
+        raise untrusted("what is no URL", "correct the catalogue") from None
     if new.scheme not in SCHEMES or not new.hostname:
         kind = f"{new.scheme}:" if new.scheme else "another host"
-        raise _untrusted(catalogue, f"{kind}, which no catalogue may", "fetch the tiles by hand")
+        raise untrusted(f"{kind}, which no catalogue may", "fetch the tiles by hand")
     if old.scheme and origin == (old.scheme, old.hostname, old.port):
         return target
     if new.hostname not in hosts:
-        raise _untrusted(
-            catalogue,
-            f"another host than its own, {new.hostname}",
-            f"if you trust it: --allow-host {new.hostname}",
-        )
+        remedy = f"if you trust it: --allow-host {new.hostname}"
+        raise untrusted(f"another host than its own, {new.hostname}", remedy)
     if old.scheme == "https" and new.scheme == "http":
-        raise _untrusted(catalogue, "http, and came by https itself", "fetch the tiles by hand")
+        raise untrusted("http, and came by https itself", "fetch the tiles by hand")
     return target
 
 
@@ -494,7 +462,3 @@ def _joined(href: str, catalogue: str) -> str:
         return href
     # urljoin does not know s3:
     return urljoin(catalogue.replace("s3://", "http://", 1), href).replace("http://", "s3://", 1)
-
-
-def _untrusted(catalogue: str, where: str, remedy: str) -> InputError:
-    return InputError(f"a tile of it leads to {where}", file=catalogue, remedy=remedy)

@@ -1,10 +1,10 @@
 """Lists of tiles: which files a catalogue has for a site, as a sheet that one can read.
 
-A list is written once, by the command that looks into the catalogue and asks the servers; what runs
-is what stands in it. A plan reads the list alone and asks nobody. Each tile has the size and the
-content (ETag) that its server has told: a tile that is another one by then ends the job that reads
-it. The lines before the columns (``# key: value``) hold where the tiles come from and how much of
-the footprint no tile covers.
+A list is written once, by the command that looks into the catalogue and asks the servers. A plan
+reads the list alone and asks nobody. Each tile has the size and the content (ETag) that its server
+has told: a tile that is another one by then ends the job that reads it. The lines before the
+columns (``# key: value``) hold where the tiles come from and how much of the footprint no tile
+covers.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from ..core.errors import InputError
 from ..core.products.files import atomic_file
 from ..core.products.remote_files import is_remote, place_of, stand_in_of
 from ..core.tables import Table
-from .footprint import Footprint
+from .lattice import Footprint
 
 SUFFIX = ".tsv"
 EPT = "ept.json"  # a file of points by its name, no catalogue
 CATALOGUES = (".vpc", ".json", ".geojson", ".gpkg")
 TITLE = "# tiles of a catalogue, written by stereotruth: see docs/how-to/national_lidar.md"
+REMEDY = "write it again: stereotruth lidar CATALOGUE --to FILE"
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class TileList:
 
     ``catalogue``: path or URL, without secrets; ``sha256`` and ``bytes`` of it; ``hosts`` that its
     tiles' servers may redirect to; ``ground`` that was asked for, as runs of cells
-    (:class:`.footprint.Footprint`), ``footprint_m2`` its area, ``hole_m2`` of it in no tile;
+    (:class:`.lattice.Footprint`), ``footprint_m2`` its area, ``hole_m2`` of it in no tile;
     ``crs``: that of all tiles by the catalogue, or empty.
     """
 
@@ -87,7 +88,7 @@ class TileList:
         )
 
 
-HEAD = ("catalogue", "sha256", "bytes", "hosts", "ground", "footprint_m2", "hole_m2", "crs")
+HEAD = tuple(field.name for field in fields(TileList) if field.name != "tiles")
 COLUMNS = tuple(field.name for field in fields(ListedTile))
 
 
@@ -108,12 +109,10 @@ def write_list(listed: TileList, to: str | Path) -> None:
     """Write a list; whole or not at all."""
     stream = io.StringIO()
     stream.write(f"{TITLE}\n")
-    for key in HEAD:
-        value = getattr(listed, key)
-        text = " ".join(value) if key == "hosts" else str(value)
-        text = json.dumps(value) if key == "ground" else text
+    texts = {key: str(getattr(listed, key)) for key in HEAD}
+    texts |= {"hosts": " ".join(listed.hosts), "ground": json.dumps(listed.ground)}
+    for key, text in (texts | {"count": str(len(listed.tiles))}).items():
         stream.write(f"# {key}: {' '.join(text.split())}\n")
-    stream.write(f"# count: {len(listed.tiles)}\n")
     writer = csv.writer(stream, delimiter="\t", lineterminator="\n")
     writer.writerow(COLUMNS)
     writer.writerows(asdict(tile).values() for tile in listed.tiles)
@@ -124,9 +123,8 @@ def write_list(listed: TileList, to: str | Path) -> None:
 
 def read_list(file: str | Path) -> TileList:
     """A list of tiles. Raises InputError: missing, damaged, no list of tiles."""
-    remedy = "write it again: stereotruth lidar CATALOGUE --to FILE"
-    table = Table.read(file, remedy, "\t")
-    table.require(COLUMNS, COLUMNS, remedy)
+    table = Table.read(file, REMEDY, "\t")
+    table.require(COLUMNS, COLUMNS, REMEDY)
     head = table.declared
     try:
         tiles = tuple(
@@ -139,21 +137,17 @@ def read_list(file: str | Path) -> TileList:
             raise ValueError("it names no tile, or one without a file")
         for day in (day for tile in tiles for day in (tile.start, tile.end) if day):
             date.fromisoformat(day)
-        return TileList(
-            catalogue=head["catalogue"],
-            sha256=head["sha256"],
-            bytes=int(head["bytes"]),
-            hosts=tuple(head["hosts"].split()),
-            ground=tuple((int(a), int(b), int(c)) for a, b, c in json.loads(head["ground"])),
-            footprint_m2=float(head["footprint_m2"]),
-            hole_m2=float(head["hole_m2"]),
-            crs=head["crs"],
-            tiles=tiles,
-        )
+        values = {key: head[key] for key in HEAD} | {
+            "bytes": int(head["bytes"]),
+            "hosts": tuple(head["hosts"].split()),
+            "ground": tuple((int(a), int(b), int(c)) for a, b, c in json.loads(head["ground"])),
+            "footprint_m2": float(head["footprint_m2"]),
+            "hole_m2": float(head["hole_m2"]),
+        }
+        return TileList(**values, tiles=tiles)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(
-            f"no list of tiles that can be read ({error})", file=file, remedy=remedy
-        ) from None
+        problem = f"no list of tiles that can be read ({error})"
+        raise InputError(problem, file=file, remedy=REMEDY) from None
 
 
 def files_of_list(file: str | Path) -> list[str]:
@@ -174,7 +168,7 @@ def files_of_list(file: str | Path) -> list[str]:
 def days_of_list(file: str | Path) -> dict[str, list[str]]:
     """First and last day of the tiles of a list that says them, by path; see files_of_list."""
     return {
-        os.fspath(place_of(tile.file)) if is_remote(tile.file) else os.fspath(Path(tile.file)): [
+        os.fspath(place_of(tile.file) if is_remote(tile.file) else Path(tile.file)): [
             tile.start,
             tile.end or tile.start,
         ]

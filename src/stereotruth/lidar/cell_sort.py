@@ -1,4 +1,4 @@
-"""Points of a file brought into the order of their cells, in bounded memory."""
+"""Points brought into the order of their cells in bounded memory, and written as a point store."""
 
 from __future__ import annotations
 
@@ -7,22 +7,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
-from .lattice import CELL_BITS, cell_key
-from .point_store import CELL, CELLS, POINTS, SQUARES, STRIPS, WORDS
+from ..core.products.files import sealed
+from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key
+from .point_store import ATTRIBUTES, CELL, CELLS, POINTS, SQUARES, STRIPS, WORDS
 
 Integers = NDArray[np.int64]
 Words = NDArray[np.uint32]
 
-
 RUN_WORDS = WORDS + 1  # of 32 bits, of a point in the scratch: with the codes of its strip
 RUN_BYTES = 4 * RUN_WORDS
 SCRATCH_POINTS = (1 << 28) // RUN_BYTES  # kept in memory, 256 MiB
+
+
+def bounds_of(limits: Integers) -> list[float]:
+    """lon_min, lat_min, lon_max, lat_max (degrees), h_min, h_max (m) of lattice limits [2, 3]."""
+    low, high = limits
+    degrees = (float(value) / PER_DEG for value in (low[0], low[1], high[0], high[1]))
+    return [*degrees, float(low[2]) / PER_M, float(high[2]) / PER_M]
 
 
 @kernel
@@ -87,7 +94,7 @@ def _count_squares(points: Words, counts: Integers) -> None:
         counts[(points[i, 1] & inside) // size, (points[i, 0] & inside) // size] += 1
 
 
-def _cells(lattice: Integers) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _cells(lattice: Integers) -> tuple[Integers, Integers]:
     """Keys of cells [m], sorted, and the number among these of each point's cell [n]."""
     low_col, low_row = lattice[:2].min(axis=1) >> CELL_BITS
     high_col, high_row = lattice[:2].max(axis=1) >> CELL_BITS
@@ -107,60 +114,69 @@ class SortedRuns:
 
     A segment is what one run holds of one cell; segments of a cell, in the order of the runs, are
     its points in the order of the file. Runs are in ``memory`` [k, 4]; those that find no room
-    there any more are on ``disk``.
+    there any more are on ``disk``. ``written``: points so far.
     """
 
     memory: Words
     disk: BinaryIO
     written: int = 0
-    held: int = 0  # in memory, the first ones
-    segments: list[np.ndarray] = field(default_factory=list)  # int64 [k, 3]: key, start, count
-    limits: list[np.ndarray] = field(default_factory=list)  # int32 [k, 2]: lowest, highest
+    _held: int = 0  # in memory, the first ones
+    _segments: list[np.ndarray] = field(default_factory=list)  # int64 [k, 3]: key, start, count
+    _limits: list[np.ndarray] = field(default_factory=list)  # int32 [k, 2]: lowest, highest
 
-    def add(self, lattice: NDArray[np.int64], attributes: Words, strips: Words) -> None:
+    @classmethod
+    def of(cls, room: int, disk: BinaryIO) -> SortedRuns:
+        """Without a point. ``room``: points in memory; ``disk`` is emptied."""
+        disk.seek(0)
+        disk.truncate()
+        return cls(np.empty((room, RUN_WORDS), "<u4"), disk)
+
+    def add(self, lattice: Integers, attributes: Words, strips: Words) -> None:
         """Take in a chunk's points: lattice coordinates [3, n], attributes and codes of strips [n]
-        as of _unpack."""
+        as of :meth:`.point_fields.PointTally.take`."""
         size = attributes.size
         if not size:
             return
         key, cell = _cells(lattice)
         end, limits = np.zeros(key.size, np.int64), np.empty((key.size, 2), np.int32)
-        room = self.held == self.written and self.held + size <= len(self.memory)
+        has_room = self._held == self.written and self._held + size <= len(self.memory)
         run = (
-            self.memory[self.held : self.held + size]
-            if room
+            self.memory[self._held : self._held + size]
+            if has_room
             else np.empty((size, RUN_WORDS), "<u4")
         )
         _sort(lattice, attributes, strips, cell, end, limits, run)
-        if room:
-            self.held += size
+        if has_room:
+            self._held += size
         else:
             self.disk.write(run)  # unlike ndarray.tofile it says why it fails
         count = np.diff(end, prepend=0)
         here = count > 0
         segments = np.stack([key, end - count + self.written, count], axis=1)
-        self.segments.append(segments[here])
-        self.limits.append(limits[here])
+        self._segments.append(segments[here])
+        self._limits.append(limits[here])
         self.written += size
 
     def _take(self, segments: Integers) -> Iterator[Words]:
         """The points of segments, each at once."""
         for _, start, count in segments.tolist():
-            if start < self.held:
+            if start < self._held:
                 yield self.memory[start : start + count]
                 continue
             points = np.empty((count, RUN_WORDS), "<u4")
-            self.disk.seek((start - self.held) * RUN_BYTES)
+            self.disk.seek((start - self._held) * RUN_BYTES)
             if self.disk.readinto(points.data.cast("B")) != points.nbytes:
                 raise OSError("the scratch file of the points is cut short")
             yield points
 
-    def write(self, folder: Path, strips_at: int | None) -> tuple[int, list[int]]:
-        """Write points and cell table in final order, and the points' strips unless ``strips_at``
-        is None: the bit where their code begins. Returns the CRC-32 of the table's file, and of the
-        strips of each cell."""
-        segments = np.concatenate([np.empty((0, 3), np.int64), *self.segments])
-        limits = np.concatenate([np.empty((0, 2), np.int32), *self.limits])
+    def write(self, folder: Path, attrs: dict[str, Any], strips_at: int | None) -> None:
+        """Write a point store: points and cell table in final order, and the points' strips unless
+        ``strips_at`` is None: the bit where their code begins.
+
+        ``attrs`` get the CRC-32 of the table's file, and of the strips of each cell.
+        """
+        segments = np.concatenate([np.empty((0, 3), np.int64), *self._segments])
+        limits = np.concatenate([np.empty((0, 2), np.int32), *self._limits])
         order = np.argsort(segments[:, 0], kind="stable")
         segments, limits = segments[order], limits[order]
         key, first = np.unique(segments[:, 0], return_index=True)
@@ -173,13 +189,13 @@ class SortedRuns:
         of_cells = np.split(segments, first[1:]) if key.size else ()
         with _array_file(folder / POINTS, "<u4", (self.written, WORDS)) as file:
             for cell, of in enumerate(of_cells):
-                found, squares = 0, np.zeros((SQUARES, SQUARES), np.int64)
+                crc32, squares = 0, np.zeros((SQUARES, SQUARES), np.int64)
                 for run in self._take(of):
                     points = np.ascontiguousarray(run[:, :WORDS])
-                    found = zlib.crc32(points, found)
+                    crc32 = zlib.crc32(points, crc32)
                     _count_squares(points, squares)
                     file.write(points)
-                table["crc32"][cell] = found
+                table["crc32"][cell] = crc32
                 table["squares"][cell] = np.minimum(squares, 65535)
         np.save(folder / CELLS, table)
         sums: list[int] = []
@@ -191,7 +207,9 @@ class SortedRuns:
                         codes = (run[:, WORDS] >> strips_at).astype("<u2")
                         sums[-1] = zlib.crc32(codes, sums[-1])
                         file.write(codes)
-        return zlib.crc32((folder / CELLS).read_bytes()), sums
+        attrs["cells_crc32"] = zlib.crc32((folder / CELLS).read_bytes())
+        attrs["strips"] = {**attrs["strips"], "crc32": sums}
+        (folder / ATTRIBUTES).write_text(sealed(attrs), encoding="utf-8")
 
 
 @contextmanager

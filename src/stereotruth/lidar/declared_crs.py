@@ -1,14 +1,19 @@
 """The coordinate system that a file declares, or that its user gives it: places, heights, units.
 
-The one reader of systems: of LiDAR, surface models, control points and geoid grids.
+The one reader of systems: of LiDAR, surface models, control points and geoid grids. GDAL is asked
+for what rasterio and laspy do not tell: GeoTIFF keys of a LAS file, and the epoch of a raster.
 """
 
 from __future__ import annotations
 
 import re
+import struct
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import laspy
 import numpy as np
@@ -19,6 +24,9 @@ from pyproj.exceptions import CRSError, ProjError
 from ..core.errors import InputError
 from ..core.numerics.geometry import DEGREE_M
 
+if TYPE_CHECKING:
+    import rasterio  # which few files need
+
 VERTICAL_UNITS_KEY = 4099
 LINEAR_UNITS = {  # EPSG code: (name, metres)
     9001: ("metre", 1.0),
@@ -26,17 +34,19 @@ LINEAR_UNITS = {  # EPSG code: (name, metres)
     9003: ("US survey foot", 1200 / 3937),
 }
 LENGTHS = {  # names of units in files: metres
-    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
-    **dict.fromkeys(("dm", "decimetre", "decimeter", "decimetres", "decimeters"), 0.1),
-    **dict.fromkeys(("cm", "centimetre", "centimeter", "centimetres", "centimeters"), 0.01),
-    **dict.fromkeys(("mm", "millimetre", "millimeter", "millimetres", "millimeters"), 0.001),
-    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
-    **dict.fromkeys(
-        ("us-ft", "us_ft", "ftus", "us survey foot", "us survey feet", "foot_us", "sft"),
-        1200 / 3937,
-    ),
+    name: metres
+    for metres, names in (
+        (1.0, "m, metre, meter, metres, meters"),
+        (0.1, "dm, decimetre, decimeter, decimetres, decimeters"),
+        (0.01, "cm, centimetre, centimeter, centimetres, centimeters"),
+        (0.001, "mm, millimetre, millimeter, millimetres, millimeters"),
+        (0.3048, "ft, foot, feet, international foot, international feet"),
+        (1200 / 3937, "us-ft, us_ft, ftus, us survey foot, us survey feet, foot_us, sft"),
+    )
+    for name in names.split(", ")
 }
 SAME_UNIT = 1e-5  # of a unit: feet and US survey feet of a band's name are often not told apart
+DEPTHS = "they are depths"  # of a system whose vertical axis points down
 _NO_DATUM = {"", "unknown", "unnamed", "not specified", "unspecified"}
 _WITH_EPOCH = re.compile(  # WKT2:2019, clause 16, which PROJ reads as no system
     r"\s*COORDINATEMETADATA\s*\[(.*\])\s*,\s*EPOCH\s*\[\s*([0-9.]+)\s*\]\s*\]\s*",
@@ -101,7 +111,7 @@ class LidarCRS:
         return self.ellipsoidal or self.vertical_datum is not None
 
 
-def _source(crs: CRS) -> CRS:
+def unbound(crs: CRS) -> CRS:
     """The system itself where it comes bound to a transformation (TOWGS84, grid files)."""
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
@@ -111,7 +121,7 @@ def degrees_of(horizontal: CRS, x: Any, y: Any) -> tuple[Any, Any] | None:
 
     None of a system without a datum, or of a damaged one.
     """
-    source = _source(horizontal)
+    source = unbound(horizontal)
     if source.geodetic_crs is None:
         return None
     try:
@@ -121,46 +131,30 @@ def degrees_of(horizontal: CRS, x: Any, y: Any) -> tuple[Any, Any] | None:
     return change.transform(x, y)
 
 
-DEPTHS = "they are depths"  # of a system whose vertical axis points down
-
-
-def _refuse_depths(crs: CRS, axis: Any) -> None:
-    if axis.direction.lower() != "up":
-        raise ValueError(f"the heights of '{crs.name}' point {axis.direction}: {DEPTHS}")
-
-
 def interpret(crs: CRS) -> LidarCRS:
     """Split a system into its horizontal and vertical meaning.
 
     Raises ValueError for systems that are not geographic or projected (local, geocentric) and for
     vertical axes that point down.
     """
-    parts = crs.sub_crs_list if crs.is_compound else [crs]
-    first = _source(parts[0])
+    horizontal, *rest = crs.sub_crs_list if crs.is_compound else [crs]
+    first = unbound(horizontal)
     if not (first.is_geographic or first.is_projected):
         raise ValueError(f"'{crs.name}' is a {first.type_name}, neither geographic nor projected")
-    if crs.is_compound:
-        vertical = _source(parts[1])
+    datum = None
+    if rest:
+        vertical = unbound(rest[0])
         axis = vertical.axis_info[0]
-        _refuse_depths(crs, axis)
-        datum = vertical.datum.name if vertical.datum is not None else vertical.name
-        unnamed = {datum.lower(), vertical.name.lower()} <= _NO_DATUM
-        return LidarCRS(
-            parts[0],
-            vertical_datum=None if unnamed else (vertical.name or datum),
-            vertical_unit_m=axis.unit_conversion_factor,
-            vertical_unit=axis.unit_name,
-        )
-    if len(first.axis_info) == 3:
-        axis = first.axis_info[2]
-        _refuse_depths(crs, axis)
-        return LidarCRS(
-            crs.to_2d(),
-            ellipsoidal=True,
-            vertical_unit_m=axis.unit_conversion_factor,
-            vertical_unit=axis.unit_name,
-        )
-    return LidarCRS(crs)
+        name = vertical.datum.name if vertical.datum is not None else vertical.name
+        if not {name.lower(), vertical.name.lower()} <= _NO_DATUM:
+            datum = vertical.name or name
+    elif len(first.axis_info) == 3:
+        axis, horizontal = first.axis_info[2], crs.to_2d()
+    else:
+        return LidarCRS(crs)
+    if axis.direction.lower() != "up":
+        raise ValueError(f"the heights of '{crs.name}' point {axis.direction}: {DEPTHS}")
+    return LidarCRS(horizontal, datum, not rest, axis.unit_conversion_factor, axis.unit_name)
 
 
 def interpret_wkt(text: str) -> LidarCRS:
@@ -229,23 +223,70 @@ def of_raster(wkt: str, band_unit: str, file: str | Path) -> LidarCRS:
     return system
 
 
-def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS | None:
-    """The system of GeoKeys, user-defined projections and vertical keys included.
+def epoch_of(raster: rasterio.DatasetReader) -> float | None:
+    """Epoch of an open raster's coordinates (decimal year), as GDAL writes it into a VRT of it."""
+    import rasterio.shutil
 
-    GDAL does the reading, but passes over the vertical unit (key 4099) where the vertical system
-    has a code of its own; LAStools and others write "NAVD88 in US survey feet" just so, hence the
-    key is honoured here.
+    with rasterio.MemoryFile(ext=".vrt") as memory:
+        rasterio.shutil.copy(raster, memory.name, driver="VRT")
+        found = re.search(rb' coordinateEpoch="([0-9.]+)"', memory.read())
+    return float(found[1]) if found else None
+
+
+def _geokeys_tiff(shorts: np.ndarray, doubles: bytes, text: bytes) -> bytes:
+    """A TIFF of one pixel that carries the GeoKeys of a LAS file, for GDAL to interpret."""
+    blobs = {
+        33550: (12, 3, struct.pack("<3d", 1, 1, 0)),
+        33922: (12, 6, struct.pack("<6d", 0, 0, 0, 0, 0, 0)),
+        34735: (3, shorts.size, shorts.astype("<u2").tobytes()),
+        34736: (12, len(doubles) // 8, doubles[: len(doubles) // 8 * 8]),
+        34737: (2, len(text), text),
+    }
+    blobs = {tag: blob for tag, blob in blobs.items() if blob[1]}
+    plain = {256: 1, 257: 1, 258: 8, 259: 1, 262: 1, 277: 1, 278: 1, 279: 1}
+    end = 8 + 2 + 12 * (len(plain) + 1 + len(blobs)) + 4
+    entries = [(tag, 4, 1, value) for tag, value in plain.items()] + [(273, 4, 1, end)]
+    data = bytes(8)
+    for tag, (kind, count, blob) in blobs.items():
+        entries.append((tag, kind, count, end + len(data)))
+        data += blob + bytes(8 - len(blob) % 8)
+    directory = b"".join(struct.pack("<HHII", *entry) for entry in sorted(entries))
+    return b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + bytes(4) + data
+
+
+def _from_geokeys(data: bytes, doubles: bytes, text: bytes) -> LidarCRS | None:
+    """The system of GeoKeys (records 34735, 34736 and 34737), None if they name none.
+
+    GDAL does the reading, user-defined projections included, but passes over the vertical unit (key
+    4099) where the vertical system has a code of its own; LAStools and others write "NAVD88 in US
+    survey feet" just so, hence the key is honoured here.
+
+    Raises ValueError if GDAL cannot read them, or as :func:`interpret`.
     """
-    from .geokeys import wkt_of_geokeys  # GDAL, which few files need
+    if len(data) < 16:
+        return None
+    import rasterio
+    from rasterio.errors import RasterioError
 
-    keys = shorts[4:].reshape(-1, 4)
+    shorts = np.frombuffer(data[: 8 + (len(data) - 8) // 8 * 8], "<u2")
+    keys = shorts[4 : 4 + 4 * int(shorts[3])].reshape(-1, 4)
     keys = keys[keys[:, 0] != 0]  # some writers count a terminating zero key
     keys = keys[np.argsort(keys[:, 0], kind="stable")]
     shorts = np.concatenate([[1, 1, 0, len(keys)], keys.ravel()])
-    wkt, epoch = wkt_of_geokeys(shorts, doubles, text)
-    if not wkt:
-        return None
-    meaning = interpret(CRS.from_wkt(wkt))
+    try:
+        with (
+            rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"),
+            rasterio.MemoryFile(_geokeys_tiff(shorts, doubles, text)) as memory,
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")  # "not georeferenced"
+            with memory.open() as tiff:
+                if not tiff.crs:
+                    return None
+                wkt, epoch = tiff.crs.to_wkt(), epoch_of(tiff)
+    except RasterioError as error:
+        raise ValueError(str(error)) from error
+    meaning = replace(interpret(CRS.from_wkt(wkt)), epoch=epoch)
     for key, location, _, value in keys.tolist():
         if key == VERTICAL_UNITS_KEY and location == 0 and value in LINEAR_UNITS:
             name, metres = LINEAR_UNITS[value]
@@ -256,12 +297,12 @@ def _from_geokeys(shorts: np.ndarray, doubles: bytes, text: bytes) -> LidarCRS |
                 )
                 meaning = replace(meaning, notes=(note,))
             meaning = replace(meaning, vertical_unit_m=metres, vertical_unit=name)
-    return replace(meaning, epoch=epoch)
+    return meaning
 
 
 def _held_against_code(meaning: LidarCRS, x: float, y: float) -> LidarCRS:
     """With a note if a system is another than that of the EPSG code which it names for itself."""
-    identity = _source(meaning.horizontal).to_json_dict().get("id", {})
+    identity = unbound(meaning.horizontal).to_json_dict().get("id", {})
     if identity.get("authority") != "EPSG":
         return meaning
     try:
@@ -287,42 +328,27 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
     for record in [*header.vlrs, *(header.evlrs or [])]:
         if record.user_id == "LASF_Projection":
             records.setdefault(record.record_id, record.record_data_bytes())
-    found: list[LidarCRS] = []
+    x, y = float(header.mins[0]), float(header.mins[1])
+    wkt = records.get(2112, b"").split(b"\0")[0].decode("utf-8", errors="replace").strip()
+    readers: dict[str, Callable[[], LidarCRS | None]] = {
+        "WKT": lambda: _held_against_code(interpret_wkt(wkt), x, y) if wkt else None,
+        "GeoTIFF keys": partial(
+            _from_geokeys, *(records.get(number, b"") for number in (34735, 34736, 34737))
+        ),
+    }
+    meanings: list[LidarCRS] = []
     problems: list[str] = []
-
-    def attempt(what: str, read) -> None:
+    for what in readers if header.global_encoding.wkt else reversed(readers):
         try:
-            meaning = read()
+            meaning = readers[what]()
         except (ProjError, ValueError) as error:
             problems.append(f"its {what} cannot be used ({error})")
         else:
-            if meaning is not None:
-                found.append(meaning)
-
-    def wkt() -> None:
-        data = records.get(2112, b"").split(b"\0")[0]
-        if text := data.decode("utf-8", errors="replace").strip():
-            x, y = float(header.mins[0]), float(header.mins[1])
-            attempt("WKT", lambda: _held_against_code(interpret_wkt(text), x, y))
-
-    def geokeys() -> None:
-        data = records.get(34735, b"")
-        if len(data) >= 16:
-            shorts = np.frombuffer(data[: 8 + (len(data) - 8) // 8 * 8], "<u2")
-            shorts = shorts[: 4 + 4 * int(shorts[3])]
-            attempt(
-                "GeoTIFF keys",
-                lambda: _from_geokeys(shorts, records.get(34736, b""), records.get(34737, b"")),
-            )
-
-    order = (wkt, geokeys) if header.global_encoding.wkt else (geokeys, wkt)
-    for read in order:
-        read()
-    if not found:
+            meanings += [meaning] if meaning is not None else []
+    if not meanings:
         return None, problems
-    best = max(found, key=lambda meaning: meaning.has_vertical)  # max keeps the first
-    x, y = float(header.mins[0]), float(header.mins[1])
-    if not _same_horizontal(found[0].horizontal, found[-1].horizontal, x, y):
+    best = max(meanings, key=lambda meaning: meaning.has_vertical)  # max keeps the first
+    if not _same_horizontal(meanings[0].horizontal, meanings[-1].horizontal, x, y):
         note = f"its WKT and its GeoTIFF keys describe different systems: '{best.name}' is used"
         best = replace(best, notes=(*best.notes, note))
     return best, problems
@@ -339,7 +365,7 @@ def _same_horizontal(one: CRS, other: CRS, x: float, y: float) -> bool:
     if None in places:
         return False
     off_m = np.abs(np.subtract(*places)).max() * DEGREE_M
-    axes = [_source(crs).geodetic_crs.ellipsoid.semi_major_metre for crs in (one, other)]
+    axes = [unbound(crs).geodetic_crs.ellipsoid.semi_major_metre for crs in (one, other)]
     return bool(off_m < 1e-3 and abs(axes[0] - axes[1]) < 0.01)  # nor NaN
 
 
@@ -356,7 +382,6 @@ def resolve(
             depths[0], file=file, remedy="write the file again with heights, which point up"
         )
     given = parse_crs(lidar_crs) if lidar_crs else None
-    notes: list[str] = []
     if own is None:
         if given is None:
             reason = "; ".join(problems) if problems else "the file declares none"
@@ -365,26 +390,21 @@ def resolve(
                 file=file,
                 remedy="set lidar_crs (EPSG code, compound EPSG code or WKT) for this scene",
             )
-        notes += [f"lidar_crs is used, since {problem}" for problem in problems]
-        return given, notes
-    notes += own.notes
+        return given, [f"lidar_crs is used, since {problem}" for problem in problems]
+    notes = list(own.notes)
     if given is None:
         return own, notes
-    x, y = header.mins[0], header.mins[1]
-    if not _same_horizontal(own.horizontal, given.horizontal, float(x), float(y)):
+    x, y = float(header.mins[0]), float(header.mins[1])
+    if not _same_horizontal(own.horizontal, given.horizontal, x, y):
         notes.append(
             f"the file's own system '{own.name}' is used, not lidar_crs '{given.name}', "
             "which serves files that declare none"
         )
     elif given.has_vertical and not own.has_vertical:
-        unit_m, unit = own.vertical_unit_m, own.vertical_unit
-        own = replace(
-            own,
-            vertical_datum=given.vertical_datum,
-            ellipsoidal=given.ellipsoidal,
-            vertical_unit_m=given.vertical_unit_m if unit_m is None else unit_m,
-            vertical_unit=given.vertical_unit if unit_m is None else unit,
-        )
+        own = replace(own, vertical_datum=given.vertical_datum, ellipsoidal=given.ellipsoidal)
+        if own.vertical_unit_m is None:
+            unit = {"vertical_unit_m": given.vertical_unit_m, "vertical_unit": given.vertical_unit}
+            own = replace(own, **unit)
         notes.append(f"heights as lidar_crs says ('{own.name}'), the file declares none")
     elif given.has_vertical and (
         (own.ellipsoidal, own.vertical_datum) != (given.ellipsoidal, given.vertical_datum)

@@ -1,23 +1,15 @@
 """From the terrestrial frame of coordinates to ITRF2020 at the date of the images.
 
-RPCs and control points by GNSS are in the ITRF of their day, which WGS 84 (G…) follows to a
-centimetre. National frames move with their plate, or stand still since an epoch of their own: they
-are 0.3 to 2 m away from it. To WGS 84 PROJ moves most of them by nothing, with an accuracy of 1 to
-4 m. So frames go to ITRF2020 here, in two legs that are both explicit, since PROJ does nothing when
-the epoch alone changes:
+Two legs, both explicit, since PROJ does nothing when the epoch alone changes: the frame to ITRF2020
+at the epoch of the coordinates, by PROJ's time-dependent transformation or that of the ITRF that
+the frame is a realisation of (:data:`REALISATIONS`); and from that epoch to that of the target by
+the motion of the plate. Which epoch the coordinates of a frame have: docs/explanation/frames.md.
 
-1. the frame to ITRF2020 at the epoch of the coordinates, by PROJ's time-dependent transformation
-   (Helmert, 14 parameters, EPSG's) or that of the ITRF that the frame is a realisation of;
-2. from that epoch to that of the target by the motion of the plate (:mod:`.plate_motion`).
-
-What the epoch of the coordinates is follows from the kind of frame:
-
-- a frame that moves with its plate (NAD83, ETRS89, GDA2020): coordinates hold at any time, and the
-  first leg is taken at the target's epoch;
-- a frame that stands for ITRF at one epoch (NZGD2000: ITRF96 at 2000.0): that epoch;
-- a dynamic frame (ITRF2014, WGS 84 (G1762)): the epoch that the file or ``lidar_epoch`` states;
-- WGS 84 without a realisation names no frame: ITRF2020, at the stated epoch, or else at the
-  target's.
+Plates: ITRF2020 Plate Motion Model, Altamimi et al. (2023), doi 10.1029/2023GL106373, tables 1 and
+2. As the paper advises, the bias of the origin's rate is added to the horizontal velocities, and
+what it makes of vertical ones is left out. The plates' outlines are coarse: straight lines between
+places that lie some tens of km beside the boundaries of Bird (2003, doi 10.1029/2001GC000252).
+Zones that belong to no rigid plate of the model (Japan, Anatolia, Iceland …) lie in none of them.
 """
 
 from __future__ import annotations
@@ -39,7 +31,6 @@ from pyproj.transformer import TransformerGroup
 
 from ..core.errors import InputError
 from ..core.numerics.geometry import turn
-from .plate_motion import moved, plate_at, speed
 
 Floats = NDArray[np.float64]
 Place = tuple[Floats, Floats, Floats]
@@ -55,6 +46,8 @@ NEAR_DEG = 0.5  # around a place for which the transformation is chosen
 UNKNOWN_M = 0.03  # a tenth of the finest pixel: places that may be farther off are refused
 MOST_M_A = 0.08  # by which any place on Earth moves in a year
 SETTLED_M = 1e-4  # motion that is left out: the step of heights in point stores
+MAS = np.radians(1 / 3.6e6)  # a milliarcsecond
+ORIGIN_RATE_BIAS = (0.37e-3, 0.35e-3, 0.74e-3)  # m a year, X, Y, Z
 
 
 class Epoch(NamedTuple):
@@ -180,14 +173,13 @@ class FrameChange:
 
     def describe(self) -> dict[str, Any]:
         """Record for the attributes of a product."""
-        return record(self.target, self.frame, self.epoch, self.legs)
+        return _record(self.target, self.frame, self.epoch, self.legs)
 
 
-def record(
-    target: Epoch, frame: str, epoch: float | None, legs: tuple[str, ...] = ()
+def _record(
+    target: Epoch, frame: str, epoch: float | None, legs: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Record of coordinates in ITRF2020 at ``target``, and of the frame and epoch that they come
-    from (``epoch``: None where they hold at any)."""
+    """Of coordinates in ITRF2020 at ``target``, and the frame and epoch that they come from."""
     source = {"frame": frame, "epoch": epoch, "legs": list(legs)}
     return {"frame": NAME, "epoch": round(target.year, 4), "by": target.by, "source": source}
 
@@ -195,9 +187,9 @@ def record(
 def taken_as_it_is(geodetic: CRS | None, target: Epoch) -> dict[str, Any]:
     """Record of coordinates that :func:`frame_change` leaves to PROJ's way to WGS 84."""
     if geodetic is not None and datum_code(geodetic) == WGS84_ENSEMBLE:
-        return record(target, WGS84_NAME, round(target.year, 4))
+        return _record(target, WGS84_NAME, round(target.year, 4), ())
     name = "unknown" if geodetic is None else geodetic.name
-    return record(target, f"{name}, to WGS 84 by PROJ and that taken as {NAME}", None)
+    return _record(target, f"{name}, to WGS 84 by PROJ and that taken as {NAME}", None, ())
 
 
 def datum_code(geodetic: CRS) -> int | None:
@@ -251,13 +243,6 @@ def _operation(source: CRS, target: int, place: tuple[float, float]) -> pyproj.T
     return next(good, None)
 
 
-def _at(operation: pyproj.Transformer, epoch: float) -> Callable[[Floats, Floats, Floats], Place]:
-    def transform(lon: Floats, lat: Floats, height: Floats) -> Place:
-        return operation.transform(lon, lat, height, np.full(np.shape(lon), epoch))[:3]
-
-    return transform
-
-
 @dataclass(frozen=True)
 class _Way:
     """From a frame to ITRF2020 by PROJ: operations, one after the other, and what they mean."""
@@ -296,26 +281,18 @@ def _way(datum: int, place: tuple[float, float]) -> _Way | None:
     return _Way((*before, best), known.epoch, dynamic, known.spread_m, notes)
 
 
+def _at(operation: pyproj.Transformer, epoch: float) -> Callable[[Floats, Floats, Floats], Place]:
+    def transform(lon: Floats, lat: Floats, height: Floats) -> Place:
+        return operation.transform(lon, lat, height, np.full(np.shape(lon), epoch))[:3]
+
+    return transform
+
+
 def _words(operation: pyproj.Transformer) -> str:
     """What an operation does, without what is no more than another form of coordinates."""
     parts = operation.description.split(" + ")
     forms = ("axis order change", "Conversion from", "Null geographic offset")
     return " + ".join(part for part in parts if not part.startswith(forms)) or "nothing"
-
-
-def _refuse_without_epoch(
-    name: str, datum: int, place: tuple[float, float], plate: str | None, goal: float
-) -> None:
-    """Raise InputError if coordinates that may be of any epoch since their frame's may be off."""
-    since = Datum.from_epsg(datum).to_json_dict().get("frame_reference_epoch", goal)
-    m_a = MOST_M_A if plate is None else speed(*place, plate)
-    if m_a * abs(goal - since) > UNKNOWN_M:
-        raise InputError(
-            f"coordinates in {name} move by {1000 * m_a:.0f} mm a year here, and nothing states "
-            "their epoch",
-            remedy="state it, as 2016.4 or 2016-05-27: lidar_epoch of the scene, '# epoch:' above "
-            "control points (gcps import: --epoch), gdal_edit.py -a_coord_epoch of a raster",
-        )
 
 
 def frame_change(
@@ -337,21 +314,28 @@ def frame_change(
     datum = datum_code(geodetic)
     if datum is None or (datum == WGS84_ENSEMBLE and epoch is None):
         return None
-    goal = target.year
-    if datum == WGS84_ENSEMBLE:
-        way = _Way((), epoch, True)
-        name = WGS84_NAME
-    else:
-        found = _way(datum, place)
-        if found is None:
-            return None
-        way, name = found, geodetic.name
+    is_wgs84 = datum == WGS84_ENSEMBLE
+    way = _Way((), epoch, True) if is_wgs84 else _way(datum, place)
+    if way is None:
+        return None
+    name, goal = WGS84_NAME if is_wgs84 else geodetic.name, target.year
     plate = plate_at(*place)
+    m_a = None if plate is None else speed(*place, plate)
     own = way.epoch if way.epoch is not None else epoch if way.dynamic else None
     if way.dynamic and own is None:
-        _refuse_without_epoch(name, datum, place, plate, goal)
+        since = Datum.from_epsg(datum).to_json_dict().get("frame_reference_epoch", goal)
+        fastest = MOST_M_A if m_a is None else m_a
+        if fastest * abs(goal - since) > UNKNOWN_M:
+            raise InputError(
+                f"coordinates in {name} move by {1000 * fastest:.0f} mm a year here, and nothing "
+                "states their epoch",
+                remedy="state it, as 2016.4 or 2016-05-27: lidar_epoch of the scene, '# epoch:' "
+                "above control points (gcps import: --epoch), gdal_edit.py -a_coord_epoch of a "
+                "raster",
+            )
         own = goal
-    if own is not None and plate is None and abs(own - goal) * MOST_M_A > UNKNOWN_M:
+    years = 0.0 if own is None else goal - own
+    if plate is None and abs(years) * MOST_M_A > UNKNOWN_M:
         if way.epoch is not None:
             return None
         raise InputError(
@@ -360,20 +344,17 @@ def frame_change(
             remedy="transform the points to ITRF2020 at that date by the country's own service, "
             "and state that date as their epoch",
         )
-    steps: list[Callable[[Floats, Floats, Floats], Place]] = []
-    legs = []
-    for operation in way.operations:
-        steps.append(_at(operation, goal if own is None else own))
-        legs.append(f"{_words(operation)}, at {goal if own is None else own:.3f}")
-    years = 0.0 if own is None else goal - own
-    if plate is not None and abs(years) * speed(*place, plate) > SETTLED_M:
+    at = goal if own is None else own
+    steps = [_at(operation, at) for operation in way.operations]
+    legs = [f"{_words(operation)}, at {at:.3f}" for operation in way.operations]
+    notes = list(way.notes)
+    if plate is not None and abs(years) * m_a > SETTLED_M:
         steps.append(partial(moved, plate=plate, years=years))
         legs.append(f"ITRF2020 from {own:.3f} to {goal:.3f} with the plate {plate}")
-    notes = list(way.notes)
     if not target.by and plate is not None:
         notes.append(
             f"the date of the images is not known, it is taken as {goal:g}: places in ITRF2020 "
-            f"move by {1000 * speed(*place, plate):.0f} mm a year here"
+            f"move by {1000 * m_a:.0f} mm a year here"
         )
     return FrameChange(
         frame=name,
@@ -385,3 +366,113 @@ def frame_change(
         geographic=_geographic(datum),
         _steps=tuple(steps),
     )
+
+
+# ------------------------------------------------------------------ plates
+
+ROTATION = {  # mas a year about X, Y, Z
+    "AMUR": (-0.131, -0.551, 0.837),
+    "ANTA": (-0.269, -0.312, 0.678),
+    "ARAB": (1.129, -0.146, 1.438),
+    "AUST": (1.487, 1.175, 1.223),
+    "CARB": (0.207, -1.422, 0.726),
+    "EURA": (-0.085, -0.519, 0.753),
+    "INDI": (1.137, 0.013, 1.444),
+    "NAZC": (-0.327, -1.561, 1.605),
+    "NOAM": (0.045, -0.666, -0.098),
+    "NUBI": (0.090, -0.585, 0.717),
+    "PCFC": (-0.404, 1.021, -2.154),
+    "SOAM": (-0.261, -0.282, -0.157),
+    "SOMA": (-0.081, -0.719, 0.864),
+}
+
+# From Fiordland along the Alpine and the Hope Fault to the Hikurangi Trough.
+_NEW_ZEALAND = (
+    "165.6 -46.8, 167.0 -45.2, 167.9 -44.55, 168.7 -44.1, 169.4 -43.8, 170.2 -43.4, 171.45 -42.75, "
+    "172.9 -42.5, 173.9 -42.4, 175.3 -42.0, 177 -41, 178.5 -39.5, 179.4 -37.5"
+)
+_NEW_ZEALAND_BACK = ", ".join(reversed(_NEW_ZEALAND.split(", ")))
+# The San Andreas Fault from Cape Mendocino to the Gulf of California.
+_CALIFORNIA = (
+    "-124.4 40.3, -123.7 38.9, -122.5 37.7, -121.2 36.6, -119.9 35.1, -118.5 34.7, -117.4 34.2, "
+    "-116.2 33.6, -115.5 32.6, -114.5 31, -109 23.5"
+)
+
+
+# Longitude and latitude of the corners; the first outline that a place lies in counts.
+OUTLINES = (
+    ("AUST", f"110 -11, 120 -11, 128 -11, 142 -9.6, 146 -11, 156 -13, 165 -21.5, 171 -23, 179 -35, "
+     f"{_NEW_ZEALAND_BACK}, 160 -50, 135 -48, 108 -42"),
+    ("PCFC", f"{_NEW_ZEALAND}, 184 -37, 184 -53, 166 -53"),
+    ("PCFC", f"-160 5, -160 45, -135 45, {_CALIFORNIA}, -120 10"),
+    ("AMUR", "112 50, 118 42.5, 122 39, 125.5 33, 130 34.5, 131.5 42, 139 48, 139 53.5, 120 55.5"),
+    ("EURA", "-24 37.5, -10 36.4, -5.5 36, 0 37.6, 8 38.8, 12.4 37.4, 15.4 37.6, 19 39.6, 20.5 42, "
+     "28.5 41.8, 41 43.5, 50 42, 58 39, 68 38.5, 74 36.5, 80 35.5, 92 28.5, 99 25, 102 21.5, "
+     "107 20.5, 112 17.5, 119.5 24, 123 29, 124 37, 122 39, 118 42.5, 112 50, 120 55.5, 131 62, "
+     "138 68, 140 82, 0 84, 5 74, -8 70, -12 66.5, -13 63, -28 55, -28 40"),
+    ("NOAM", f"-168 71, -166 64, -157 60.5, -145 61.5, -135 57.8, -131.5 53.5, -125 48.4, "
+     f"-124.2 43, {_CALIFORNIA}, -105.3 20.3, -98 17, -93.5 16, -88.5 17.5, -86 21.3, -75 21.2, "
+     "-66 21, -55 22, -46 25, -34 45, -33 57, -40 60, -28 67.5, -18 70.5, -8 82, -60 86, -168 80"),
+    ("CARB", "-81 12.5, -75.5 17.3, -68 17.5, -64.5 17.6, -62 18.2, -60.2 15, -60.7 11.8, "
+     "-66 12.2, -72 13.2, -79 10.5"),
+    ("SOAM", "-76 -14.5, -79 -5, -77.5 -2, -76 1, -73.5 5, -71 8, -63 10.2, -59 12.5, -45 9, "
+     "-32 0, -20 -15, -18 -45, -55 -53, -66 -54, -73 -50, -72.5 -40, -70.5 -33, -69 -20, -71 -16"),
+    ("ARAB", "35.7 29, 36.3 33, 38 36.3, 42 36.8, 45.5 34, 48.5 30.2, 52 27, 56 26, 58 24.8, "
+     "60 22.5, 58 17, 52 14.8, 45 13, 43 13.8, 40.5 19.5, 37 24.5"),
+    ("SOMA", "43 10.8, 52 12.8, 60 2, 62 -22, 54 -32, 37 -33, 36 -20, 37 -6, 39.5 3, 41.5 8"),
+    ("NUBI", "-28 37, -6 35.4, -1.5 35, 9 37, 12 33.5, 20 33.2, 31 32.2, 33.5 28.2, 36.5 22, "
+     "39 16, 39.5 13.5, 38 8.5, 36 4.5, 31 3.5, 29 -2, 29 -7, 32 -11, 33.5 -19, 32 -27, 33 -36, "
+     "20 -46, -8 -40, -12 0, -25 15, -28 30"),
+    ("INDI", "67.5 24, 70.5 29.5, 74.5 32.2, 80 28.8, 88 26.6, 91.5 25.8, 91 21.5, 90 10, 86 2, "
+     "72 2, 66 16"),
+    ("ANTA", "-180 -90, -180 -64, 180 -64, 180 -90"),
+)  # fmt: skip
+
+
+def plate_at(lon: float, lat: float) -> str | None:
+    """The plate (ITRF2020's abbreviation) of a place in degrees; None where none of them is."""
+    for plate, outline in OUTLINES:
+        corners = np.array([corner.split() for corner in outline.split(", ")], float)
+        turns = np.round((corners[:, 0].mean() - lon) / 360.0) * 360.0
+        x, y = corners[:, 0] - (lon + turns), corners[:, 1] - lat
+        x_after, y_after = np.roll(x, -1), np.roll(y, -1)
+        crosses = (y > 0) != (y_after > 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = x - y * (x_after - x) / (y_after - y)
+        if np.count_nonzero(crosses & (at > 0)) % 2:
+            return plate
+    return None
+
+
+@cache
+def _to_geocentric() -> pyproj.Transformer:
+    return pyproj.Transformer.from_pipeline("+proj=pipeline +step +proj=cart +ellps=GRS80")
+
+
+def _velocity(lon: Floats, lat: Floats, xyz: Floats, plate: str) -> Floats:
+    """Geocentric velocity [3, n], m a year: the rotation's, and the bias' horizontal part."""
+    spin = np.array(ROTATION[plate])[:, None] * MAS
+    bias = np.array(ORIGIN_RATE_BIAS)[:, None]
+    lon, lat = np.radians(lon), np.radians(lat)
+    up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    return np.cross(spin, xyz, axis=0) + bias - (bias * up).sum(axis=0) * up
+
+
+def speed(lon: float, lat: float, plate: str) -> float:
+    """Of a place on a plate, m a year."""
+    place = np.array([[lon], [lat], [0.0]])
+    xyz = np.stack(_to_geocentric().transform(*place))
+    return float(np.linalg.norm(_velocity(place[0], place[1], xyz, plate)))
+
+
+def moved(
+    lon: Floats, lat: Floats, height: Floats, plate: str, years: float
+) -> tuple[Floats, Floats, Floats]:
+    """Longitude, latitude (degrees) and ellipsoidal height (m) after some years, each float64[n].
+
+    In ITRF2020, GRS 80. Places that are not finite stay so.
+    """
+    xyz = np.stack(_to_geocentric().transform(lon, lat, height))
+    there = xyz + years * _velocity(lon, lat, xyz, plate)
+    east, north, up = _to_geocentric().transform(*there, direction="INVERSE")
+    return east, north, up

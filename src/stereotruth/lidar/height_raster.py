@@ -1,24 +1,32 @@
 """Rasters of heights on the ground: where their cells lie, and what their heights count from.
 
 The one reader of surface models and elevation models, for LiDAR, scores and control points: values
-by :mod:`..products.raster_values`, systems by :mod:`.declared_crs`, datums by :mod:`.to_wgs84`.
-Pixels that are points (AREA_OR_POINT) are the middles of their cells: GDAL brings the grid to that.
+by :mod:`..core.products.raster_values`, systems by :mod:`.declared_crs`, datums by
+:mod:`.to_wgs84`. Pixels that are points (AREA_OR_POINT) are the middles of their cells.
 
 Places are metres on the ground along the raster's columns and against its rows, from the centre of
 the upper-left cell: (x, y) = (column · dx, −row · dy), dx and dy being what a cell measures on the
 ellipsoid in the raster's middle. So any north-up grid serves, in degrees, feet or a projection
 whose metres are none on the ground; :meth:`HeightRaster.to_enu` turns shifts to east and north.
+
+As LiDAR, each cell that has a height becomes a point in its middle, a record of LAS format 6 of
+class 1 (unclassified), the only return of its pulse.
 """
 
 from __future__ import annotations
 
+import io
 import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
+import pyproj
 import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import RasterioError
@@ -27,10 +35,19 @@ from rasterio.windows import Window as RasterWindow
 from ..core.errors import InputError
 from ..core.numerics.geometry import exact_metres_per_degree, turn
 from ..core.numerics.interpolation import bilinear
-from ..core.products.rasters import HEIGHT, Fills, Quantity, Values, open_raster
-from .declared_crs import LidarCRS, of_raster
+from ..core.products.file_parts import open_stream
+from ..core.products.rasters import (
+    HEIGHT,
+    MOST_CELLS,
+    Fills,
+    Quantity,
+    Values,
+    open_raster,
+    refuse_bands,
+)
+from ..core.products.remote_files import url_of
+from .declared_crs import LidarCRS, epoch_of, of_raster
 from .frames import Epochs
-from .geokeys import epoch_of
 from .to_wgs84 import ToWGS84, transformation
 
 log = logging.getLogger("stereotruth")
@@ -43,8 +60,16 @@ CLASSES = Quantity(
 )
 AROUND = 32  # cells around a point that are held against the rules on fill values
 
+FORMATS = ("GTiff",)  # of LiDAR
+PARTS = 64  # of a cell, that the points' coordinates are stored in: exact, as a power of two
+HEIGHT_STEP = 1e-4  # of the unit of the heights
+MOST_BLOCK_CELLS = 1 << 26  # of a block, which GDAL reads as a whole
+STREAM_BYTES = 1 << 20  # that servers are asked for at once
+SAMPLES = 64  # cells along each side that say how high a surface lies
+UNCLASSIFIED = 1
 
-def refuse_grid(raster: Any, file: Path) -> None:
+
+def _refuse_grid(raster: Any, file: Path) -> None:
     """Raise InputError unless rows run from north to south and columns from west to east."""
     at = raster.transform
     if at.b or at.d or not (at.a > 0 > at.e) or at == rasterio.Affine.identity():
@@ -57,7 +82,7 @@ def refuse_grid(raster: Any, file: Path) -> None:
         )
 
 
-def system_of(raster: Any, file: Path) -> LidarCRS | None:
+def _system_of(raster: Any, file: Path) -> LidarCRS | None:
     """What the system, the epoch and the band's unit of an open raster say; None without one."""
     if raster.crs is None:
         return None
@@ -101,12 +126,12 @@ class HeightRaster:
         try:
             with open_raster(path) as source:
                 transform, shape = source.transform, source.shape
-                system = system_of(source, path)
+                system = _system_of(source, path)
                 if system is None:
                     raise InputError(
                         "no coordinate system", file=path, remedy="set it by gdal_edit.py -a_srs"
                     )
-                refuse_grid(source, path)
+                _refuse_grid(source, path)
                 if quantity is not HEIGHT:
                     system = LidarCRS(system.horizontal, ellipsoidal=True)
                 values = Values(source, path, quantity, system.height_unit_m)
@@ -185,22 +210,22 @@ class HeightRaster:
         bottom, right = min(rows.stop, self.shape[0]), min(cols.stop, self.shape[1])
         if top >= bottom or left >= right:
             return out
+        inside = slice(top - rows.start, bottom - rows.start)
+        window = RasterWindow(left, top, right - left, bottom - top)
+        out[inside, left - cols.start : right - cols.start] = self._read(window=window)
+        return out
+
+    def _read(self, **how: Any) -> Floats:
+        """Heights in m by rasterio's ``window`` or ``out_shape``; NaN where there are none."""
         unit = self.to_wgs84.system.height_unit_m
         with open_raster(self.path) as source:
-            window = RasterWindow(left, top, right - left, bottom - top)
-            values = Values(source, self.path, self.quantity, unit).read(window=window)
-        inside = slice(top - rows.start, bottom - rows.start)
-        out[inside, left - cols.start : right - cols.start] = unit * values
-        return out
+            return unit * Values(source, self.path, self.quantity, unit).read(**how)
 
     def decimated(self, most: int) -> tuple[Floats, float]:
         """Heights in m at ``most`` cells along the longer side, and how many cells are one."""
         times = max(max(self.shape) / most, 1.0)
         shape = tuple(max(2, round(side / times)) for side in self.shape)
-        unit = self.to_wgs84.system.height_unit_m
-        with open_raster(self.path) as source:
-            values = Values(source, self.path, self.quantity, unit).read(out_shape=shape)
-        return unit * values, times
+        return self._read(out_shape=shape), times
 
     def heights_at(self, lon: Floats, lat: Floats) -> Floats:
         """Heights over the WGS 84 ellipsoid, m [n], bilinear; NaN where there is none.
@@ -249,3 +274,158 @@ class Window:
     def at(self, x: Floats, y: Floats) -> Floats:
         """Heights at places, of any shape, bilinear; NaN where one of the four cells lacks."""
         return bilinear(self.heights, *self.cells(x, y))
+
+
+# ------------------------------------------------------------------ as LiDAR
+
+
+class _Parts(io.RawIOBase):
+    """What a stand-in stands for, as GDAL reads it: an error ends the file, and is kept."""
+
+    def __init__(self, file: Path) -> None:
+        self._name, self._stream = file.name, open_stream(file, STREAM_BYTES)
+        self.failure: InputError | None = None
+
+    def opened(self, path: str, mode: str = "rb") -> _Parts:
+        """Itself by its own name; there is no other file."""
+        if path != self._name or mode != "rb":
+            raise FileNotFoundError(path)
+        return self
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def seekable(self) -> bool:
+        """It is."""
+        return True
+
+    def tell(self) -> int:
+        """The place of the next byte."""
+        return self._stream.tell()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place, as of any stream."""
+        return self._stream.seek(offset, whence)
+
+    def read(self, size: int = -1) -> bytes:
+        """So many bytes; none after an error."""
+        try:
+            return b"" if self.failure else self._stream.read(size)
+        except InputError as error:
+            self.failure = error
+            return b""
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[tuple[Values, LidarCRS | None]]:
+    """The values and the system of a raster of heights. Raises InputError if it is no such raster.
+
+    Of a stand-in, GDAL is given the parts that servers send to this package: left to itself it
+    follows redirects to anywhere.
+    """
+    with ExitStack() as stack:
+        parts = None if url_of(file) is None else stack.enter_context(_Parts(file))
+        try:
+            if parts is None:
+                raster = open_raster(file, formats=FORMATS)
+            else:
+                alone = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GTIFF_REPORT_COMPD_CS": True}
+                stack.enter_context(rasterio.Env(**alone))
+                raster = rasterio.open(file.name, driver=FORMATS[0], opener=parts.opened)
+            with raster:
+                refuse_bands(raster, file, HEIGHT)
+                _refuse_grid(raster, file)
+                rows, cols = raster.block_shapes[0]
+                most = max(raster.shape) * PARTS
+                if rows * cols > MOST_BLOCK_CELLS or most > np.iinfo(np.int32).max:
+                    raise InputError(
+                        f"its blocks of {rows} x {cols} cells, or its {raster.height} x "
+                        f"{raster.width} cells, are too many to be read by parts",
+                        file=file,
+                        remedy="write it again in tiles (gdal_translate -of COG), or cut it into "
+                        "several files",
+                    )
+                system = _system_of(raster, file)
+                unit_m = 1.0 if system is None else system.height_unit_m
+                yield Values(raster, file, HEIGHT, unit_m), system
+        except RasterioError as error:
+            if parts is not None and parts.failure is not None:
+                raise parts.failure from None
+            raise InputError(
+                f"no GeoTIFF that can be read ({error})",
+                file=file,
+                remedy="check or replace the file; lidar takes LAS, LAZ, COPC, and GeoTIFFs of "
+                "heights",
+            ) from None
+
+
+def raster_header(file: Path) -> laspy.LasHeader:
+    """The header that a LAS file of the cells would have.
+
+    ``point_count`` is the number of all cells; the lowest and highest height are NaN, since only
+    the cells tell them. Raises InputError: missing, unreadable, no raster of heights.
+    """
+    if not file.is_file():
+        raise InputError("no such LiDAR file", file=file, remedy="correct the path in scenes.tsv")
+    with _opened(file) as (values, system):
+        raster = values.dataset
+        at, (rows, cols) = raster.transform, raster.shape
+        header = laspy.LasHeader(point_format=6, version="1.4")
+        header.scales = np.array([at.a / PARTS, -at.e / PARTS, HEIGHT_STEP])
+        header.offsets = np.array([at.c, at.f + rows * at.e, 0.0])
+        half = np.array([at.a, -at.e]) / 2
+        size = np.array([cols * at.a, rows * -at.e])
+        header.mins = np.array([*(header.offsets[:2] + half), np.nan])
+        header.maxs = np.array([*(header.offsets[:2] + size - half), np.nan])
+        header.point_count = rows * cols
+        if system is not None:
+            wkt = pyproj.CRS.from_wkt(raster.crs.to_wkt()).to_wkt()
+            if not system.has_vertical and system.vertical_unit_m is not None:  # of the band
+                wkt = (
+                    f'COMPOUNDCRS["unknown",{wkt},VERTCRS["unknown",VDATUM["unknown"],'
+                    'CS[vertical,1],AXIS["up",up],'
+                    f'LENGTHUNIT["{system.vertical_unit}",{system.vertical_unit_m!r}]]]'
+                )
+            if system.epoch is not None:
+                wkt = f"COORDINATEMETADATA[{wkt},EPOCH[{system.epoch!r}]]"
+            header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "", wkt.encode() + b"\0"))
+            header.global_encoding.wkt = True
+    return header
+
+
+def sampled_heights(file: Path) -> tuple[float, float] | None:
+    """Lowest and highest of some cells all over the raster, in its unit; None where all lack.
+
+    Of a raster of :data:`.raster_values.MOST_CELLS` at most, of all. Raises InputError for values
+    that are no heights.
+    """
+    with _opened(file) as (values, _):
+        height, width = values.dataset.shape
+        if width * height <= MOST_CELLS and url_of(file) is None:
+            values.refuse_fills()
+        heights = values.read(out_shape=(min(height, SAMPLES), min(width, SAMPLES)))
+    held = heights[np.isfinite(heights)]
+    return (float(held.min()), float(held.max())) if held.size else None
+
+
+def read_cells(file: Path, header: laspy.LasHeader) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """The points of all cells that have a height, window by window of the file's blocks.
+
+    Raises InputError for values that are no heights, and for a raster that became unreadable.
+    """
+    with _opened(file) as (values, _):
+        fills = Fills(values)
+        for window in values.windows():
+            heights = fills.add(*values.raw(window=window))
+            row, col = np.nonzero(np.isfinite(heights))
+            points = laspy.ScaleAwarePointRecord.zeros(row.size, header=header)
+            points.array["X"] = (2 * (col + int(window.col_off)) + 1) * (PARTS // 2)
+            up = values.dataset.height - 1 - (row + int(window.row_off))
+            points.array["Y"] = (2 * up + 1) * (PARTS // 2)
+            points.array["Z"] = np.rint(heights[row, col] / HEIGHT_STEP)
+            points["return_number"] = points["number_of_returns"] = np.ones(row.size, np.uint8)
+            points["classification"] = np.full(row.size, UNCLASSIFIED, np.uint8)
+            if row.size:
+                yield points
+        fills.refuse()

@@ -1,45 +1,58 @@
-"""LAS, LAZ and COPC files: headers held against the file, points in chunks, what was read."""
+"""LAS and LAZ files: headers held against the file before a library believes it, points in chunks.
+
+Decoders take memory and time by what a file announces: 68 GB by four bytes of a chunk table, hours
+by a number of records. So whatever announces a number, a length or a place is looked at here
+first. Sources: LAS 1.4 R16 (ASPRS), "Public Header Block", "Variable Length Records"; the LAZ
+specification 1.4 R1 (ASPRS), "LASzip VLR", "Chunk Table", "Layered Chunks".
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import struct
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import laspy
+import lazrs
 import numpy as np
-from laspy.header import GpsTimeType
+from laspy.compression import DecompressionSelection
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.kernels import inner, kernel
 from ..core.products.file_parts import GLANCE_BYTES, STREAM_BYTES, open_stream
 from ..core.products.remote_files import size_of
-from .gps_times import GpsDays
-from .las_layout import check_layout, wrong_count
-from .strip_codes import StripCodes
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
-
-
-FAR_SHARE, FAR_M = 0.1, 10.0  # of points outside of the header's bounds: see compare_bounds
-_ANEW = "fetch the file again, or have its header written anew if that is what is wrong"
+HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}  # by minor version
+RECORD_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)  # by point data record format
+VLR_BYTES, EVLR_BYTES = 54, 60
+LASZIP = (b"laszip encoded", 22204)
+CHUNKED, LAYERED = 2, 3  # kinds of compression that have a chunk table
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}  # by type of item; extra bytes (14) have one each
+EXTRA_BYTES = 14
+VARIABLE = 0xFFFFFFFF  # size of chunks that differ
 SAMPLES = 16  # points all over a file that its header's bounds are held against
 LAZ_CHUNK = 50_000  # points of a chunk, as all software writes it
-SAMPLE_POINTS = 100_000  # first points of a file, on which quantised coordinates are looked for
+FIELDS = (  # that are decoded
+    DecompressionSelection.XY_RETURNS_CHANNEL
+    | DecompressionSelection.Z
+    | DecompressionSelection.CLASSIFICATION
+    | DecompressionSelection.FLAGS
+    | DecompressionSelection.POINT_SOURCE_ID
+    | DecompressionSelection.GPS_TIME
+)
 
 
-def has_days(header: laspy.LasHeader) -> bool:
-    """Whether the points' times tell the day."""
-    names = set(header.point_format.dimension_names)
-    return "gps_time" in names and header.global_encoding.gps_time_type == GpsTimeType.STANDARD
+def require(right: bool, problem: str) -> None:
+    """Raise ValueError unless something is right."""
+    if not right:
+        raise ValueError(problem)
 
 
 @contextmanager
-def _decoding(refusal: Callable[[BaseException], InputError]) -> Iterator[None]:
+def decoding(refusal: Callable[[BaseException], InputError]) -> Iterator[None]:
     """Whatever libraries raise on damaged bytes becomes a refusal.
 
     Panics of lazrs too, which are no Exception; want of memory not.
@@ -54,10 +67,235 @@ def _decoding(refusal: Callable[[BaseException], InputError]) -> Iterator[None]:
         raise refusal(error) from error
 
 
+def wrong_count(file: Path, announced: int, held: str, error: object = "") -> InputError:
+    """Refusal of a file whose header announces another number of points than is there."""
+    return InputError(
+        f"truncated or damaged: the header announces {announced} points, {held}"
+        + (f" ({error})" if error else ""),
+        file=file,
+        remedy="fetch or write the file again",
+    )
+
+
+@dataclass(frozen=True)
+class Packing:
+    """A LASzip record: kind of compression, points of a chunk, number of a chunk's layers."""
+
+    kind: int
+    chunk_points: int
+    layers: int
+    record: bytes
+
+    @classmethod
+    def of(cls, record: bytes, record_bytes: int) -> Packing:
+        """Of the bytes of a LASzip record. Raises ValueError if they cannot be."""
+        require(len(record) >= 34, "its LASzip record is cut short")
+        kind, chunk_points, count = (
+            struct.unpack_from(form, record, at)[0]
+            for form, at in (("<H", 0), ("<I", 12), ("<H", 32))
+        )
+        require(len(record) >= 34 + 6 * count, "its LASzip record is cut short")
+        items = [struct.unpack_from("<HH", record, 34 + 6 * k) for k in range(count)]
+        require(
+            sum(size for _, size in items) == record_bytes,
+            f"its LASzip record describes points of other than {record_bytes} bytes",
+        )
+        require(kind in (CHUNKED, LAYERED), f"compression of kind {kind} is not known")
+        require(chunk_points > 0, "its chunks have no points")
+        layers = sum(size if of == EXTRA_BYTES else LAYERS.get(of, 0) for of, size in items)
+        return cls(kind, chunk_points, layers, record)
+
+
+@dataclass
+class Layout:
+    """Counts that a header states, and places in bytes from the file's start.
+
+    Of LAZ, ``packing`` and the ``chunks``: points and bytes [n, 2].
+    """
+
+    size: int
+    minor: int
+    header_bytes: int
+    first_point: int
+    vlrs: int
+    compressed: bool
+    format: int
+    record_bytes: int
+    points: int
+    first_evlr: int = 0
+    evlrs: int = 0
+    packing: Packing | None = None
+    chunks: NDArray[np.int64] | None = None
+
+    @classmethod
+    def of(cls, stream: BinaryIO, size: int) -> Layout:
+        """Of the first bytes of a file of ``size`` bytes. Raises ValueError if they cannot be."""
+        head = stream.read(393)
+        require(head[:4] == b"LASF" and len(head) >= 227, "it does not begin as LAS")
+        major, minor = head[24:26]
+        require(major == 1 and minor in HEADER_BYTES, f"LAS {major}.{minor} is not known")
+        header_bytes, first_point, vlrs, kind, record_bytes, points = struct.unpack_from(
+            "<HIIBHI", head, 94
+        )
+        require(
+            HEADER_BYTES[minor] <= header_bytes <= first_point <= size,
+            f"a header of {header_bytes} bytes and points from byte {first_point} on do not go "
+            f"into {size} bytes of LAS 1.{minor}",
+        )
+        kind, compressed = kind & 63, kind > 63
+        require(
+            kind < len(RECORD_BYTES) and record_bytes >= RECORD_BYTES[kind],
+            f"points of format {kind} do not go into {record_bytes} bytes",
+        )
+        scales_and_offsets = np.frombuffer(head, "<f8", 6, 131)
+        require(
+            bool(np.isfinite(scales_and_offsets).all() and (scales_and_offsets[:3] > 0).all()),
+            f"scales and offsets of its coordinates are {scales_and_offsets.tolist()}",
+        )
+        behind = (0, 0)
+        if minor >= 4:
+            *behind, long_points = struct.unpack_from("<QIQ", head, 235)
+            require(
+                points in (0, long_points) or kind > 5,
+                f"its two counts of points are {points} and {long_points}",
+            )
+            points = long_points
+        places = header_bytes, first_point, vlrs, compressed, kind, record_bytes, points
+        return cls(size, minor, *places, *behind)
+
+
+def records(
+    stream: BinaryIO, start: int, end: int, count: int, extended: bool
+) -> list[tuple[bytes, int, int, int]]:
+    """User, number, start and length of the (extended) variable length records, all before end."""
+    head_bytes, what = (EVLR_BYTES, "extended ") if extended else (VLR_BYTES, "")
+    what += "variable length records"
+    require(
+        start + count * head_bytes <= end, f"{count} {what} do not fit between {start} and {end}"
+    )
+    found = []
+    for _ in range(count):
+        stream.seek(start)
+        head = stream.read(head_bytes)
+        require(len(head) == head_bytes and start + head_bytes <= end, f"its {what} are cut short")
+        number, length = struct.unpack_from("<HQ" if extended else "<HH", head, 18)
+        found.append((head[2:18].split(b"\0")[0], number, start + head_bytes, length))
+        start += head_bytes + length
+        require(start <= end, f"its {what} reach to byte {start}, past {end}")
+    return found
+
+
+def _checked_chunks(stream: BinaryIO, layout: Layout, packing: Packing, file: Path) -> Any:
+    """Points and bytes of the chunks [n, 2] by the chunk table, which is held against the file."""
+    first = layout.first_point + 8
+    stream.seek(layout.first_point)
+    place = stream.read(8)
+    missing = "0 can be read, as its chunk table is missing"
+    if len(place) < 8:
+        raise wrong_count(file, layout.points, missing)
+    (table,) = struct.unpack("<q", place)
+    if table == -1:  # written in one go: the place of the table stands at the end
+        stream.seek(layout.size - 8)
+        (table,) = struct.unpack("<q", stream.read(8))
+    if not first <= table <= layout.size - 8:
+        raise wrong_count(file, layout.points, missing)
+    stream.seek(table)
+    version, count = struct.unpack("<II", stream.read(8))
+    room = table - first
+    require(
+        version == 0 and count * layout.record_bytes <= room,
+        f"its chunk table of version {version} has {count} chunks in {room} bytes",
+    )
+    per_chunk, points = packing.chunk_points, layout.points
+    if per_chunk != VARIABLE and count != -(-points // per_chunk):
+        raise wrong_count(file, points, f"its chunks hold {count * per_chunk}")
+    stream.seek(layout.first_point)
+    read = lazrs.read_chunk_table(stream, lazrs.LazVlr(packing.record)) or []
+    sizes = np.array([size for _, size in read], np.float64)
+    require(
+        len(read) == count and bool((sizes >= layout.record_bytes).all()) and sizes.sum() == room,
+        f"the chunks of its chunk table do not fill the {room} bytes before it",
+    )
+    chunks = np.array(read, np.int64).reshape(-1, 2)
+    if per_chunk == VARIABLE and (total := int(chunks[:, 0].sum())) != points:
+        raise wrong_count(file, points, f"its chunks hold {total}")
+    return chunks
+
+
+def _check_layers(stream: BinaryIO, layout: Layout, packing: Packing, file: Path) -> None:
+    """Hold the head of each layered chunk against the chunk table."""
+    head, at = layout.record_bytes + 4 + 4 * packing.layers, layout.first_point + 8
+    wanted = layout.chunks[:, 0].copy()
+    if packing.chunk_points != VARIABLE:
+        wanted[-1] = layout.points - (len(wanted) - 1) * packing.chunk_points
+    for k, size in enumerate(layout.chunks[:, 1].tolist()):
+        stream.seek(at + layout.record_bytes)
+        numbers = np.frombuffer(stream.read(head - layout.record_bytes), "<u4").astype(np.int64)
+        require(
+            numbers.size == 1 + packing.layers and head + int(numbers[1:].sum()) == size,
+            f"the layers of chunk {k + 1} of {len(wanted)} do not fill it",
+        )
+        if numbers[0] != wanted[k]:
+            total = layout.points + int(numbers[0] - wanted[k])
+            raise wrong_count(file, layout.points, f"its chunks hold {total}")
+        at += size
+
+
+def check_layout(file: Path, layers: bool = True) -> Layout:
+    """The places and counts of a file's header, after all of them were found to fit into it.
+
+    ``layers``: look at the head of each chunk, too, and so all over the file.
+
+    Raises InputError: no LAS, truncated, damaged, or never completed.
+    """
+    size = size_of(file)
+    try:
+        with open_stream(file, STREAM_BYTES if layers else GLANCE_BYTES) as stream:
+            layout = Layout.of(stream, size)
+            room = size - layout.first_point
+            vlrs = records(
+                stream, layout.header_bytes, layout.first_point, layout.vlrs, extended=False
+            )
+            if layout.points == 0:
+                raise InputError(
+                    "the header announces 0 points"
+                    + (f", {room} bytes follow it: it was never completed" if room > 100 else ""),
+                    file=file,
+                    remedy="remove the file, or write it again",
+                )
+            if layout.compressed:
+                found = [vlr for vlr in vlrs if vlr[:2] == LASZIP]
+                require(len(found) == 1, f"it has {len(found)} LASzip records instead of one")
+                stream.seek(found[0][2])
+                packing = Packing.of(stream.read(found[0][3]), layout.record_bytes)
+                layout.packing = packing
+                layout.chunks = _checked_chunks(stream, layout, packing, file)
+                if layers and packing.kind == LAYERED:
+                    _check_layers(stream, layout, packing, file)
+            elif room // layout.record_bytes < layout.points:
+                held = f"the file holds {room // layout.record_bytes}"
+                raise wrong_count(file, layout.points, held)
+            if layout.evlrs:
+                require(
+                    layout.first_point <= layout.first_evlr <= size,
+                    f"its extended variable length records begin at byte {layout.first_evlr}",
+                )
+                records(stream, layout.first_evlr, size, layout.evlrs, extended=True)
+    except InputError:
+        raise
+    except (ValueError, lazrs.LazrsError, struct.error, OSError) as error:
+        raise InputError(
+            f"no readable LAS or LAZ file, truncated or damaged ({error})",
+            file=file,
+            remedy="fetch or write the file again",
+        ) from error
+    return layout
+
+
 def read_header(file: str | Path, layers: bool = True) -> laspy.LasHeader:
     """Header of a LAS or LAZ file whose counts agree with what the file holds.
 
-    ``layers``: see :func:`.las_layout.check_layout`.
+    ``layers``: see :func:`check_layout`.
 
     Raises InputError: missing, no LAS, empty, truncated (both counts are named).
     """
@@ -65,14 +303,9 @@ def read_header(file: str | Path, layers: bool = True) -> laspy.LasHeader:
     if not file.is_file():
         raise InputError("no such LiDAR file", file=file, remedy="correct the path in scenes.tsv")
     check_layout(file, layers)
+    unreadable = "no readable LAS or LAZ file"
     with (
-        _decoding(
-            lambda error: InputError(
-                f"no readable LAS or LAZ file ({error})",
-                file=file,
-                remedy="check or replace the file",
-            )
-        ),
+        decoding(lambda e: InputError(f"{unreadable} ({e})", file=file, remedy="replace the file")),
         open_stream(file, STREAM_BYTES if layers else GLANCE_BYTES) as stream,
     ):
         header = laspy.LasHeader.read_from(stream, read_evlrs=True)
@@ -93,6 +326,18 @@ def surplus_of(header: laspy.LasHeader, file: Path) -> str | None:
     return f"the header announces {header.point_count} points, which are read; {held} would fit"
 
 
+@contextmanager
+def _reader(file: Path, block_bytes: int, **how: Any) -> Iterator[laspy.LasReader]:
+    """laspy's reader, by the backend that does not take all cores there are."""
+    with (
+        open_stream(file, block_bytes) as stream,
+        laspy.open(
+            stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False, **how
+        ) as reader,
+    ):
+        yield reader
+
+
 def read_chunks(
     file: Path, header: laspy.LasHeader, size: int
 ) -> Iterator[laspy.ScaleAwarePointRecord]:
@@ -100,31 +345,16 @@ def read_chunks(
 
     COPC is read like any LAZ, through its chunk table: whole, whatever its hierarchy pages.
     """
-    fields = laspy.DecompressionSelection
-    done = 0
-    with (
-        open_stream(file) as stream,
-        laspy.open(
-            stream,
-            closefd=False,
-            laz_backend=laspy.LazBackend.Lazrs,  # the parallel one takes all cores there are
-            read_evlrs=False,
-            decompression_selection=fields.XY_RETURNS_CHANNEL
-            | fields.Z
-            | fields.CLASSIFICATION
-            | fields.FLAGS
-            | fields.POINT_SOURCE_ID
-            | fields.GPS_TIME,
-        ) as reader,
-    ):
-        while done < header.point_count:
-            wanted = min(size, header.point_count - done)
+    done, count = 0, header.point_count
+    with _reader(file, STREAM_BYTES, decompression_selection=FIELDS) as reader:
+        while done < count:
+            wanted = min(size, count - done)
             held = f"decoding failed after {done}"
-            with _decoding(lambda e, held=held: wrong_count(file, header.point_count, held, e)):
+            with decoding(lambda e, held=held: wrong_count(file, count, held, e)):
                 points = reader.read_points(wanted)
             done += len(points)
             if len(points) < wanted:
-                raise wrong_count(file, header.point_count, f"{done} were read")
+                raise wrong_count(file, count, f"{done} were read")
             yield points
 
 
@@ -133,226 +363,17 @@ def is_outside_sampled(file: Path, header: laspy.LasHeader) -> bool:
 
     They are the first ones of chunks, so that little is decoded.
     """
-    low, high = np.asarray(header.mins), np.asarray(header.maxs)
     slack = 2 * np.asarray(header.scales)
+    low, high = np.asarray(header.mins) - slack, np.asarray(header.maxs) + slack
     places = np.linspace(0, header.point_count, SAMPLES, endpoint=False).astype(np.int64)
     with (
-        _decoding(lambda e: wrong_count(file, header.point_count, "decoding failed", e)),
-        open_stream(file, GLANCE_BYTES) as stream,
-        laspy.open(
-            stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False
-        ) as reader,
+        decoding(lambda e: wrong_count(file, header.point_count, "decoding failed", e)),
+        _reader(file, GLANCE_BYTES) as reader,
     ):
         for place in np.unique(places // LAZ_CHUNK * LAZ_CHUNK).tolist():
             reader.seek(place)
             point = reader.read_points(1)
             xyz = np.stack([np.asarray(point[axis]) for axis in "xyz"], axis=1)
-            if ((xyz < low - slack) | (xyz > high + slack)).any():
+            if ((xyz < low) | (xyz > high)).any():
                 return True
     return False
-
-
-def _no_limits() -> np.ndarray:
-    return np.array([[np.iinfo(np.int64).max] * 3, [np.iinfo(np.int64).min] * 3])
-
-
-@dataclass
-class PointTally:
-    """What is counted and checked along the way; nothing in it depends on the chunks."""
-
-    counts: Integers = field(default_factory=lambda: np.zeros((2, 257), np.int64))  # see _unpack
-    by_return: Integers = field(default_factory=lambda: np.zeros(16, np.int64))  # of all points
-    file_limits: Integers = field(default_factory=_no_limits)  # [2, 3], stored integers
-    lattice_limits: Integers = field(default_factory=_no_limits)  # [2, 3], kept points
-    sample: list[np.ndarray] = field(default_factory=list)
-    sampled: int = 0
-    days: GpsDays = field(default_factory=GpsDays)  # of all points, where they tell them
-    strips: StripCodes = field(default_factory=StripCodes)
-    synthetic: int = 0  # of all points: made by somebody, not measured
-
-    def take(
-        self,
-        points: laspy.ScaleAwarePointRecord,
-        header: laspy.LasHeader,
-        drop_classes: Sequence[int],
-    ) -> tuple[Floats, NDArray[np.uint32], NDArray[np.uint32]]:
-        """Coordinates [3, n], attributes [n], see _unpack, and codes of strips [n] of the points to
-        keep."""
-        unwanted = np.isin(np.arange(256), drop_classes)
-        raw = np.frombuffer(points.array, np.uint8).reshape(len(points), -1)
-        xyz, attributes = np.empty((3, len(points))), np.zeros((2, len(points)), np.uint32)
-        if has_days(header):
-            self.days.take(points, attributes[0])
-        attributes[1] = self.strips.take(points)
-        extended = header.point_format.id >= 6
-        bit = 1 if extended else 32  # of the flags in LAS 1.4, and of the class byte before
-        self.synthetic += int(np.count_nonzero(raw[:, 15] & bit))
-        kept = _unpack(
-            raw,
-            extended,
-            unwanted,
-            np.asarray(header.scales, np.float64),
-            np.asarray(header.offsets, np.float64),
-            xyz,
-            attributes,
-            self.counts,
-            self.by_return,
-            self.file_limits,
-        )
-        return xyz[:, :kept], attributes[0, :kept], attributes[1, :kept]
-
-    @property
-    def read(self) -> int:
-        """Points read, dropped ones included."""
-        return int(self.counts.sum())
-
-    @property
-    def kept(self) -> int:
-        """Points read that were not dropped."""
-        return int(self.counts[0].sum())
-
-    def widen(self, lattice: Integers) -> None:
-        """Widen ``lattice_limits`` by points [3, n]."""
-        if lattice.size:
-            low, high = self.lattice_limits
-            self.lattice_limits[0] = np.minimum(low, lattice.min(axis=1))
-            self.lattice_limits[1] = np.maximum(high, lattice.max(axis=1))
-
-    def extent(self, header: laspy.LasHeader) -> Floats:
-        """Lowest and highest x, y, z of all points, [2, 3]."""
-        return self.file_limits * np.asarray(header.scales) + np.asarray(header.offsets)
-
-    def dropped(self, drop_classes: Sequence[int]) -> dict[str, int]:
-        """Dropped points by reason; each counts under its first."""
-        by_class = {f"class {c}": int(self.counts[1, c]) for c in drop_classes if 0 <= c < 256}
-        return {"withheld": int(self.counts[1, 256])} | by_class
-
-    def compare_bounds(
-        self, header: laspy.LasHeader, units_m: tuple[float, float], file: Path
-    ) -> str | None:
-        """Refuse points far outside of the header's bounds: a damaged LAZ decodes into noise.
-
-        ``units_m``: metres per unit of the plane and of the heights. Far is :data:`FAR_SHARE` of
-        the side and :data:`FAR_M` more. Returns a remark where they lie outside at all.
-        """
-        scale = np.asarray(header.scales)
-        mins, maxs = np.asarray(header.mins), np.asarray(header.maxs)
-        size = maxs - mins
-        if not (np.isfinite(size).all() and size.max() > 0):
-            return None  # never filled in
-        low, high = self.extent(header)
-        beyond = np.maximum(mins - low, high - maxs)
-        if (beyond <= 2 * scale).all():
-            return None
-        text = (
-            f"points reach from {_triple(low)} to {_triple(high)}, "
-            f"the header says from {_triple(mins)} to {_triple(maxs)}"
-        )
-        metres = np.array([units_m[0], units_m[0], units_m[1]])
-        if (beyond * metres > FAR_SHARE * size * metres + FAR_M).any():
-            raise InputError(f"damaged: {text}", file=file, remedy=_ANEW)
-        return text
-
-    def compare_returns(self, header: laspy.LasHeader, file: Path) -> str | None:
-        """Refuse a file whose points are of other returns than its header counts.
-
-        They tell of points that are lost, invented or decoded into noise. Returns a remark where
-        the header has all points under the first return, as careless software writes it.
-        """
-        stated = np.asarray(header.number_of_points_by_return, np.int64)
-        stated = stated if header.version.minor >= 4 else stated[:5]
-        read = self.by_return[1 : 1 + stated.size]
-        if not stated.any() or (stated == read).all():
-            return None
-        text = f"the header counts {_counts(stated)} points by return, {_counts(read)} were read"
-        if stated[0] == header.point_count:
-            return text
-        raise InputError(f"truncated or damaged: {text}", file=file, remedy=_ANEW)
-
-    def look(self, lattice: Integers) -> None:
-        """Keep the first points for :meth:`refuse_quantised`."""
-        if (missing := SAMPLE_POINTS - self.sampled) > 0:
-            # 32 bits each: 4.3 degrees, more than a file covers
-            low = lattice[:2, :missing] & 0xFFFFFFFF
-            self.sample.append(low[0] << 32 | low[1])
-            self.sampled += len(self.sample[-1])
-
-    def refuse_quantised(self, file: Path) -> None:
-        """InputError if the file's first points share few positions."""
-        if not self.sample:
-            return
-        sample = np.sort(np.concatenate(self.sample))  # np.unique takes ten times as long
-        positions = 1 + np.count_nonzero(np.diff(sample))
-        if len(sample) >= 1000 and positions < 0.1 * len(sample):
-            raise InputError(
-                f"coordinates are quantised: {len(sample)} points lie on {positions} positions",
-                file=file,
-                remedy="write the file again with a finer scale (0.01 m, or 1e-7 degree)",
-            )
-
-
-# Kernels free the GIL; nothing in them depends on how the points are cut into chunks.
-@inner
-def _integer(raw: Bytes, i: int, at: int) -> int:
-    value = np.int64(raw[i, at]) | np.int64(raw[i, at + 1]) << 8
-    value |= np.int64(raw[i, at + 2]) << 16 | np.int64(raw[i, at + 3]) << 24
-    return np.int64(np.int32(value))
-
-
-@kernel
-def _unpack(
-    raw: Bytes,
-    extended: bool,
-    unwanted: NDArray[np.bool_],
-    scale: Floats,
-    offset: Floats,
-    xyz: Floats,
-    attributes: NDArray[np.uint32],
-    counts: Integers,
-    by_return: Integers,
-    limits: Integers,
-) -> int:
-    """Fill ``xyz`` [3, n] and ``attributes`` [2, n] with the points to keep; returns their number.
-
-    ``raw`` [n, size] are point data records; ``extended``: of formats 6 to 10. The places of fields
-    in them are those of LAS 1.4 R16, "Point Data Record Format 0" and "6". ``unwanted`` [256] by
-    class. Attributes are class + 256 return number + 2**16 number of returns + 2**20 code of the
-    day, and codes of the strip; of all points, ``attributes`` have the code of the day and these.
-    ``counts`` [2, 257]: of kept and of dropped points by class, the last of withheld ones;
-    ``by_return`` [16]: of all points by return number. ``limits`` [2, 3]: lowest and highest stored
-    coordinates of all.
-    """
-    kept = 0
-    low_x, low_y, low_z = limits[0]
-    high_x, high_y, high_z = limits[1]
-    for i in range(raw.shape[0]):
-        x, y, z = _integer(raw, i, 0), _integer(raw, i, 4), _integer(raw, i, 8)
-        low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
-        high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
-        returns, flags = np.int64(raw[i, 14]), np.int64(raw[i, 15])
-        if extended:
-            kind, withheld = np.int64(raw[i, 16]), flags >> 2 & 1
-            returns = (returns & 15) << 8 | (returns >> 4) << 16
-        else:
-            kind, withheld = flags & 31, flags >> 7
-            returns = (returns & 7) << 8 | (returns >> 3 & 7) << 16
-        by_return[returns >> 8 & 15] += 1
-        drop = withheld | np.int64(unwanted[kind])
-        counts[drop, 256 if withheld == 1 else kind] += 1
-        xyz[0, kept] = x * scale[0] + offset[0]
-        xyz[1, kept] = y * scale[1] + offset[1]
-        xyz[2, kept] = z * scale[2] + offset[2]
-        attributes[0, kept] = kind | returns | np.int64(attributes[0, i]) << 20
-        attributes[1, kept] = attributes[1, i]
-        kept += 1 - drop
-    limits[0] = low_x, low_y, low_z
-    limits[1] = high_x, high_y, high_z
-    return kept
-
-
-def _counts(values: Integers) -> str:
-    return ", ".join(map(str, np.trim_zeros(values, "b").tolist()))
-
-
-def _triple(values: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.2f}" for value in values) + ")"

@@ -1,4 +1,7 @@
-"""A file of points, whatever its format: LAS, LAZ, COPC, or a surface model as a raster.
+"""A file of points, whatever its format: LAS, LAZ, COPC, EPT, or a surface model as a raster.
+
+A format is a class here, with the header that a LAS file of its points would have and with its
+points as records of LAS; :func:`open_points` tells which one a file has.
 
 Of a file, that part is read which may hold points of a footprint. Of an octree, these are nodes. Of
 other files it is all or nothing: nothing where the header's bounds miss the footprint. LAS headers
@@ -19,12 +22,13 @@ import numpy as np
 from ..core.products.file_parts import open_stream
 from ..core.products.remote_files import size_of
 from . import las_files
-from .copc import Copc
-from .octree import Octree, Touches
+from .catalogue_list import EPT
+from .octree import Touches, open_octree
 
-OCTREE, EPT = ".copc.laz", "ept.json"
+OCTREE = ".copc.laz"
 FIRST_BYTES = 1 << 14  # that servers are asked for at once
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # of TIFF 6.0 and of BigTIFF
+Records = Iterator[laspy.ScaleAwarePointRecord]
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,7 @@ class Part:
 
     points: int
     bytes: int
-    chunks: Callable[[int], Iterator[laspy.ScaleAwarePointRecord]]
+    chunks: Callable[[int], Records]
     nodes: tuple[int, int] | None = None
     remark: str | None = None
 
@@ -45,60 +49,48 @@ class Part:
 class PointFile:
     """A LAS, LAZ or COPC file whose header agrees with what the file holds.
 
-    ``header``: coordinate system, scales, offsets, count and bounds of the points. ``layers``: see
-    :func:`.las_layout.check_layout`. Raises InputError if the file is missing or cannot be read.
+    ``header``: coordinate system, scales, offsets, count and bounds of the points; ``bytes``: all
+    that there is to read; ``remark``: what users are to know of it; ``cell``: side of the cells
+    that points are the middles of, 0 of points that lie anywhere. ``layers``: see
+    :func:`.las_files.check_layout`. Raises InputError if the file is missing or cannot be read.
     """
+
+    cell = 0.0
+    remark: str | None = None
 
     def __init__(self, path: Path, layers: bool = True) -> None:
         self.path = path
-        self.header = self._header(layers)
-
-    def _header(self, layers: bool) -> laspy.LasHeader:
-        return las_files.read_header(self.path, layers)
-
-    @property
-    def remark(self) -> str | None:
-        """What users are to know of it, if anything."""
-        return las_files.surplus_of(self.header, self.path)
+        self.header = las_files.read_header(path, layers)
+        self.bytes = size_of(path)
+        self.remark = las_files.surplus_of(self.header, path)
 
     @property
     def heights(self) -> tuple[float, float] | None:
         """Lowest and highest height that can be told without reading the points."""
         return float(self.header.mins[2]), float(self.header.maxs[2])
 
-    @property
-    def bytes(self) -> int:
-        """All that there is to read."""
-        return size_of(self.path)
-
-    @property
-    def cell(self) -> float:
-        """Side of the cells that points are the middles of, or 0: the points lie anywhere."""
-        return 0.0
-
-    def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
+    def _chunks(self, size: int) -> Records:
         """All points in the order of the file, about ``size`` at a time."""
         return las_files.read_chunks(self.path, self.header, size)
 
     def part(self, touches: Touches | None) -> Part:
         """What is to be read for a footprint; all of it for None."""
-        whole = Part(int(self.header.point_count), self.bytes, self.chunks)
-        if touches is None:
-            return whole
-        bounds = np.array([[self.header.mins], [self.header.maxs]], np.float64)
-        bounds = np.where(
-            np.isnan(bounds), 0.0, bounds
-        )  # heights of rasters, which only cells tell
-        if not np.isfinite(bounds).all() or not np.ptp(bounds[:, 0, :2], axis=0).any():
-            return whole  # never filled in
-        if (bounds[1, 0] < bounds[0, 0]).any() or touches(*bounds)[0]:
-            return whole
-        if self._contradicts_bounds():
+        count, remark = int(self.header.point_count), None
+        if touches is not None and self._lies_elsewhere(touches):
+            if not self._contradicts_bounds():
+                return Part(0, 0, lambda _: iter(()))
             remark = (
                 "points lie outside of its header's bounds, which count for nothing: all are read"
             )
-            return Part(whole.points, whole.bytes, whole.chunks, remark=remark)
-        return Part(0, 0, lambda _: iter(()))
+        return Part(count, self.bytes, self._chunks, remark=remark)
+
+    def _lies_elsewhere(self, touches: Touches) -> bool:
+        """Whether the header's bounds, if they were filled in, miss a footprint."""
+        bounds = np.array([[self.header.mins], [self.header.maxs]], np.float64)
+        bounds[np.isnan(bounds)] = 0.0  # heights of rasters, which only cells tell
+        if not np.isfinite(bounds).all() or not np.ptp(bounds[:, 0, :2], axis=0).any():
+            return False
+        return bool((bounds[1, 0] >= bounds[0, 0]).all()) and not touches(*bounds)[0]
 
     def _contradicts_bounds(self) -> bool:
         """Whether points lie outside of the header's bounds."""
@@ -108,25 +100,13 @@ class PointFile:
 class OctreeFile(PointFile):
     """A COPC file, or EPT, of which nodes are read; see :mod:`.octree`."""
 
-    def _header(self, layers: bool) -> laspy.LasHeader:
-        self.octree = open_octree(self.path)
-        return self.octree.header
-
-    @property
-    def remark(self) -> None:
-        """Nothing."""
-
-    @property
-    def bytes(self) -> int:
-        """Of the file, or of all nodes of EPT."""
-        return max(int(self.octree.nodes["bytes"].sum()), size_of(self.path))
-
-    def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """All points node by node, whatever the size."""
-        return self.octree.read(self.octree.plan(None))
+    def __init__(self, path: Path) -> None:
+        self.path, self.octree = path, open_octree(path)
+        self.header = self.octree.header
+        self.bytes = max(int(self.octree.nodes["bytes"].sum()), size_of(path))
 
     def part(self, touches: Touches | None) -> Part:
-        """The nodes that touch a footprint."""
+        """The nodes that touch a footprint, one by one whatever the size."""
         plan = self.octree.plan(touches)
         nodes = self.octree.nodes[plan]
         points, size = int(nodes["points"].sum()), int(nodes["bytes"].sum())
@@ -134,53 +114,29 @@ class OctreeFile(PointFile):
         return Part(points, size, lambda _: self.octree.read(plan), counts)
 
 
-def open_octree(path: str | Path) -> Octree:
-    """A COPC file (``.copc.laz``) or EPT (``ept.json``), by path or stand-in.
-
-    Raises InputError: missing, neither of both, damaged, or of a hierarchy that is not complete;
-    what a server fails with.
-    """
-    if Path(path).name.lower() == EPT:
-        from .ept import Ept  # which few scenes have
-
-        return Ept(Path(path))
-    return Copc(Path(path))
-
-
 class RasterFile(PointFile):
-    """A surface model as a raster; see :mod:`.raster_points`."""
+    """A surface model as a raster, by its own blocks; see :mod:`.height_raster`."""
 
-    def _header(self, layers: bool) -> laspy.LasHeader:
-        from .raster_points import raster_header  # GDAL, which few scenes need
+    def __init__(self, path: Path) -> None:
+        from . import height_raster  # GDAL, which few scenes need
 
-        return raster_header(self.path)
-
-    @property
-    def remark(self) -> str:
-        """What a raster cannot tell."""
-        from .raster_points import remark_on
-
-        return remark_on(self.header)
+        self._rasters = height_raster
+        self.path, self.header = path, height_raster.raster_header(path)
+        self.bytes = size_of(path)
+        self.cell = float(max(self.header.scales[:2])) * height_raster.PARTS
+        self.remark = (
+            f"a surface model of cells of {self.header.scales[0] * height_raster.PARTS:g}: its "
+            "points have no class and no returns; nothing is known of what lies under crowns"
+        )
 
     @property
     def heights(self) -> tuple[float, float] | None:
         """Of some cells all over the raster."""
-        from .raster_points import sampled_heights
+        return self._rasters.sampled_heights(self.path)
 
-        return sampled_heights(self.path)
-
-    @property
-    def cell(self) -> float:
-        """The larger side of a cell, in the unit of the plane."""
-        from .raster_points import PARTS
-
-        return float(max(self.header.scales[:2])) * PARTS
-
-    def chunks(self, size: int) -> Iterator[laspy.ScaleAwarePointRecord]:
+    def _chunks(self, size: int) -> Records:
         """The points by the raster's own blocks, whatever the size."""
-        from .raster_points import read_cells
-
-        return read_cells(self.path, self.header)
+        return self._rasters.read_cells(self.path, self.header)
 
     def _contradicts_bounds(self) -> bool:
         """No: they follow from the places of the cells."""
@@ -191,7 +147,7 @@ def open_points(path: str | Path, *, by_nodes: bool = False, layers: bool = True
     """The file by its first bytes. Raises InputError if it cannot be read.
 
     ``by_nodes``: a file that is named ``.copc.laz`` is opened as an octree; else as any LAZ, whole.
-    ``ept.json`` always is one. ``layers``: see :func:`.las_layout.check_layout`.
+    ``ept.json`` always is one. ``layers``: see :func:`.las_files.check_layout`.
     """
     path = Path(path)
     name = path.name.lower()
@@ -200,4 +156,4 @@ def open_points(path: str | Path, *, by_nodes: bool = False, layers: bool = True
     first = b""
     with suppress(OSError), open_stream(path, FIRST_BYTES) as stream:  # which the reader names
         first = stream.read(4)
-    return (RasterFile if first in TIFF_SIGNATURES else PointFile)(path, layers)
+    return RasterFile(path) if first in TIFF_SIGNATURES else PointFile(path, layers)

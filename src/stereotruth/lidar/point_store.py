@@ -9,14 +9,14 @@ A folder with plain arrays, which NumPy opens (little-endian; n points, m cells 
                               (20 to 27), return number (28 to 31);
 
                               latitude from the cell's south edge, steps (0 to 19), number of
-                              returns (20 to 23), code of the day (24 to 31, :mod:`.gps_times`);
+                              returns (20 to 23), code of the day (24 to 31, :mod:`.point_fields`);
 
                               height above the WGS 84 ellipsoid, steps (32 bits, signed)
 ``cells.npy``   CELL[m]       ``row``, ``col``: lattice latitude, longitude >> 20; ``first``: index
                               of the cell's first point; ``lowest``, ``highest``: heights of its
                               points, steps; ``crc32`` of its points as they lie in the file
 ``strips.npy``  uint16[n]     code of the strip that each point was measured in, of files with more
-                              than one (:mod:`.strip_codes`)
+                              than one (:mod:`.point_fields`)
 ``store.json``                attributes, with ``cells_crc32`` of ``cells.npy`` and a digest
 ==============  ============  =====================================================================
 
@@ -27,11 +27,10 @@ dies of a mapped file that is cut short. What is read of a cell is held against 
 
 from __future__ import annotations
 
-import re
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -41,11 +40,9 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
-from ..core.products.files import read_json
-from ..core.products.provenance import own_digest
-from .footprint import Footprint
-from .gps_times import Days, days_by_code
-from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key, lattice_box
+from ..core.products.files import read_record
+from .lattice import CELL_BITS, PER_DEG, PER_M, Footprint, apart, cell_key, lattice_box
+from .point_fields import Days, days_by_code
 
 Bytes = NDArray[np.uint8]
 Integers = NDArray[np.int64]
@@ -53,6 +50,7 @@ Words = NDArray[np.uint32]
 
 
 FORMAT = 5  # of the files
+ASSUMED = "ellipsoidal (assumed)"  # of heights that nothing declares
 POINTS, CELLS, STRIPS, ATTRIBUTES = "points.npy", "cells.npy", "strips.npy", "store.json"
 SQUARES = 16  # of a cell along each side, that its points are counted by
 WORDS = 3  # of 32 bits, of a point
@@ -176,55 +174,38 @@ class PointStore:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.attrs = self._attributes()
-        try:
-            self.bounds: tuple[float, ...] = tuple(map(float, self.attrs["bounds"]))
-            self.count = int(self.attrs["points"]["kept"])
-            cells = self._cell_table()
-        except (KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise self._damaged(ATTRIBUTES) from error
-        self.cell_row = cells["row"].astype(np.int64)
-        self.cell_col = cells["col"].astype(np.int64)
-        self.cell_heights = np.stack([cells["lowest"], cells["highest"]], axis=1)
-        self._squares = cells["squares"]
-        self._crc32 = cells["crc32"].tolist()
-        self._start = np.append(cells["first"], self.count)
-        self._key = cell_key(self.cell_row, self.cell_col)
-        self._first_of_row = np.flatnonzero(np.diff(self.cell_row, prepend=-(1 << 40)))
-        self._offset = self._first_byte(POINTS, (self.count, WORDS), "<u4")
-
-    def _attributes(self) -> dict[str, Any]:
-        file = self.path / ATTRIBUTES
-        try:
-            attrs = read_json(file)
-        except FileNotFoundError as error:
-            raise InputError(
-                "no such point store", file=self.path, remedy="run the stage that makes it"
-            ) from error
-        except InputError as error:
-            raise self._damaged(ATTRIBUTES) from error
-        if attrs.get("kind") != "points":
-            raise InputError("no point store", file=self.path, remedy="give a store made by ingest")
-        if attrs.get("format") != FORMAT:
-            raise InputError(
-                f"a point store of format {attrs.get('format')}, not {FORMAT}",
-                file=self.path,
-                remedy="delete it and run the workflow again",
-            )
-        if attrs.pop("digest", None) != own_digest(attrs):
-            raise self._damaged(ATTRIBUTES)
-        return attrs
-
-    def _cell_table(self) -> NDArray[np.void]:
+        self.attrs = read_record(
+            self.path / ATTRIBUTES, self._checked, what="point store", stage="ingest"
+        )
         try:
             data = (self.path / CELLS).read_bytes()
         except OSError as error:
             raise self._damaged(CELLS) from error
         if zlib.crc32(data) != self.attrs["cells_crc32"]:
             raise self._damaged(CELLS)
-        return np.load(BytesIO(data))
+        cells = np.load(BytesIO(data))
+        self.bounds: tuple[float, ...] = tuple(map(float, self.attrs["bounds"]))
+        self.count = int(self.attrs["points"]["kept"])
+        self.cell_row = cells["row"].astype(np.int64)
+        self.cell_col = cells["col"].astype(np.int64)
+        self.cell_heights = np.stack([cells["lowest"], cells["highest"]], axis=1)
+        self.square_counts = cells["squares"]
+        self._crc32 = cells["crc32"].tolist()
+        self._start = np.append(cells["first"], self.count)
+        self._key = cell_key(self.cell_row, self.cell_col)
+        self._first_of_row = np.flatnonzero(np.diff(self.cell_row, prepend=-(1 << 40)))
+        self._offset = self._first_byte(POINTS, (self.count, WORDS), "<u4")
+
+    def _checked(self, attrs: dict[str, Any]) -> dict[str, Any]:
+        if attrs["kind"] != "points":
+            raise ValueError(f"a {attrs['kind']}")
+        if attrs["format"] != FORMAT:
+            raise InputError(
+                f"a point store of format {attrs['format']}, not {FORMAT}",
+                file=self.path,
+                remedy="delete it and run the workflow again",
+            )
+        return attrs
 
     def _first_byte(self, name: str, shape: tuple[int, ...], kind: str) -> int:
         """Where an array begins in its file, which has the size that it should have."""
@@ -259,14 +240,20 @@ class PointStore:
         return days_by_code(self.attrs["days"], self.attrs["acquired"])
 
     @property
+    def has_assumed_heights(self) -> bool:
+        """Whether nothing declares what the heights of its file count from."""
+        return str(self.attrs["crs"]["heights"]).startswith(ASSUMED)
+
+    @property
     def cell_counts(self) -> Integers:
         """Points in each cell."""
         return np.diff(self._start)
 
-    @property
-    def square_counts(self) -> NDArray[np.uint16]:
-        """Points in each square of each cell [cells, SQUARES, SQUARES], from south and west."""
-        return self._squares
+    def cell_at(self, row: int, col: int) -> int | None:
+        """The number of the cell at a place of the lattice, if there is one."""
+        key, wanted = self._key, cell_key(row, col)
+        at = int(np.searchsorted(key, wanted))
+        return at if at < key.size and key[at] == wanted else None
 
     def _cells(self, box: tuple[int, int, int, int]) -> list[tuple[int, int]]:
         """Ranges [first, end) of cells that a lattice box touches, in order."""
@@ -284,8 +271,7 @@ class PointStore:
 
         None where there is no cell.
         """
-        west, south, east, north = self.bounds[:4]
-        if lon_max < west or lon_min > east or lat_max < south or lat_min > north:
+        if apart(self.bounds[:4], (lon_min, lat_min, lon_max, lat_max)):
             return None
         box = lattice_box(lon_min, lat_min, lon_max, lat_max)
         heights = [self.cell_heights[a:b] for a, b in self._cells(box)]
@@ -300,7 +286,16 @@ class PointStore:
         Raises InputError if they are not what was written.
         """
         box = lattice_box(lon_min, lat_min, lon_max, lat_max)
-        ranges = self._cells(box)
+        return self._points(self._cells(box), box)
+
+    def points_of(self, cell: int) -> Points:
+        """All points of a cell, in stored order. InputError if damaged."""
+        west, south = (int(of[cell]) << CELL_BITS for of in (self.cell_col, self.cell_row))
+        side = (1 << CELL_BITS) - 1
+        return self._points([(cell, cell + 1)], (west, south, west + side, south + side))
+
+    def _points(self, ranges: list[tuple[int, int]], box: tuple[int, int, int, int]) -> Points:
+        """Points of ranges of cells that lie in a lattice box."""
         total = int(sum(self._start[end] - self._start[first] for first, end in ranges))
         lattice, attributes = np.empty((3, total), np.int64), np.empty((3, total), np.uint8)
         day = np.empty(total, np.uint16)
@@ -373,15 +368,6 @@ class PointStore:
                     yield stored, np.clip(bounds - at, 0, len(stored)), cells
 
 
-def _datum_and_operation(store: PointStore) -> tuple[str, str]:
-    """The datum that a store's file was in, and what brought it to WGS 84, projections apart."""
-    crs = store.attrs.get("crs", {})
-    datum = re.search(r'(?:DATUM|ENSEMBLE)\["([^"]+)"', crs.get("wkt", ""))
-    steps = crs.get("operation", "").split(" + ")
-    steps = [step for step in steps if not step.startswith(("Inverse of ", "axis order change"))]
-    return datum[1] if datum else "", " + ".join(steps)
-
-
 def open_stores(paths: Iterable[str | Path]) -> tuple[PointStore, ...]:
     """The point stores of one scene, in the order given, but for those without a point.
 
@@ -393,8 +379,10 @@ def open_stores(paths: Iterable[str | Path]) -> tuple[PointStore, ...]:
     every = tuple(PointStore(path) for path in paths)
     stores = tuple(store for store in every if store.count) or every
     first: dict[str, tuple[str, PointStore]] = {}
-    for store in stores:
-        datum, operation = _datum_and_operation(store)
+    for store in stores if len(stores) > 1 else ():
+        steps = store.attrs["crs"]["operation"].split(" + ")  # projections apart:
+        steps = [step for step in steps if not step.startswith(("Inverse of ", "axis order"))]
+        operation, datum = " + ".join(steps), _datum_name(store.attrs["crs"]["wkt"])
         other, there = first.setdefault(datum, (operation, store))
         if other != operation:
             raise InputError(
@@ -407,6 +395,14 @@ def open_stores(paths: Iterable[str | Path]) -> tuple[PointStore, ...]:
     return stores
 
 
+@cache
+def _datum_name(wkt: str) -> str:
+    from pyproj import CRS  # which stores of one file do not need
+
+    geodetic = CRS.from_wkt(wkt).geodetic_crs
+    return "" if geodetic is None else geodetic.datum.name
+
+
 def query_points(
     stores: Sequence[PointStore | str | Path],
     lon_min: float,
@@ -416,13 +412,7 @@ def query_points(
 ) -> Points:
     """Points of a box (degrees, inclusive) in all stores, store after store."""
     opened = [s if isinstance(s, PointStore) else PointStore(s) for s in stores]
+    box = (lon_min, lat_min, lon_max, lat_max)
     return Points.concatenate(
-        [
-            store.query(lon_min, lat_min, lon_max, lat_max)
-            for store in opened
-            if store.bounds[0] <= lon_max
-            and store.bounds[2] >= lon_min
-            and store.bounds[1] <= lat_max
-            and store.bounds[3] >= lat_min
-        ]
+        [store.query(*box) for store in opened if not apart(store.bounds[:4], box)]
     )

@@ -2,26 +2,16 @@
 
 Three things decide what a LAS coordinate means, and each is settled here or refused by name:
 the horizontal system with its unit, the unit of the heights, and the surface that the heights
-count from. Sources: LAS 1.4 R16 (ASPRS), section "Coordinate Reference System"; OGC GeoTIFF 1.1;
-PROJ's promotion of 2-D systems to 3-D.
+count from. Sources: LAS 1.4 R16 (ASPRS), section "Coordinate Reference System"; OGC GeoTIFF 1.1.
 
-Rules
-- The file's own declaration wins over ``lidar_crs``, which serves files that declare none, or
-  supplies the vertical part where a file declares the same horizontal system only.
-- Heights without a unit of their own are in the unit of a projected horizontal system (the custom
-  of LAS), in metres in a geographic one.
-- Orthometric heights H need a geoid grid: h = H + N. Grids give N above the GRS 80 or WGS 84
-  ellipsoid. Nothing is ever downloaded.
-- Map projections are undone by polynomials that are checked against PROJ at run time, see
-  :mod:`stereotruth.lidar.smooth_maps`; a coordinate may come out one step of 1e-9
-  degree beside PROJ's.
-- Frames that are known to centimetres go to ITRF2020 at the date of the images
-  (:mod:`stereotruth.lidar.frames`): WGS 84 as RPCs mean it. Geoid grids count from the frame of
-  the file, so that they come first.
-- Which datum transformation is best depends on the place: on the whole degrees of longitude and
-  latitude that the points' own extent touches, whatever box the header states.
+- Orthometric heights H need a geoid grid: h = H + N. It counts from the frame of the file, so that
+  it comes before the change of frame. Nothing is ever downloaded.
 - Heights whose surface is declared nowhere are orthometric if a geoid is given, else ellipsoidal;
   but a file whose name carries the name of a vertical datum (``..._IGN69.laz``) needs the geoid.
+- Map projections are undone by polynomials that are checked against PROJ (:mod:`.smooth_maps`); a
+  coordinate may come out one step of 1e-9 degree beside PROJ's.
+- Which datum transformation is best depends on the place: on the whole degrees of longitude and
+  latitude that the points' own extent touches, whatever box the header states.
 """
 
 from __future__ import annotations
@@ -43,7 +33,7 @@ from pyproj.transformer import TransformerGroup
 
 from ..core.errors import InputError
 from ..core.numerics.geometry import continuous, turn
-from .declared_crs import DATUM_IN_NAME, LidarCRS, _source, degrees_of, resolve
+from .declared_crs import DATUM_IN_NAME, LidarCRS, degrees_of, resolve, unbound
 from .frames import Epochs, FrameChange, frame_change, taken_as_it_is
 from .smooth_maps import PatchedTransform
 
@@ -168,14 +158,13 @@ def _best_operation(
         raise ProjError("PROJ knows no transformation to WGS 84 that needs no grid")
     best = group.transformers[0]
     notes = []
-    accuracy = f"{best.accuracy:g} m" if best.accuracy >= 0 else "unknown"
     if not group.best_available and group.unavailable_operations:
-        grids = sorted(
-            {g.short_name for o in group.unavailable_operations for g in o.grids if g.short_name}
-        )
+        grids = {g.short_name for o in group.unavailable_operations for g in o.grids}
+        accuracy = f"{best.accuracy:g} m" if best.accuracy >= 0 else "unknown"
         notes.append(
-            f"better datum transformations need grids that are not installed ({', '.join(grids)}); "
-            f"used: {best.description} (accuracy {accuracy})"
+            "better datum transformations need grids that are not installed "
+            f"({', '.join(sorted(filter(None, grids)))}); used: {best.description} (accuracy "
+            f"{accuracy})"
         )
     if "ballpark" in best.description.lower():
         notes.append(
@@ -186,21 +175,20 @@ def _best_operation(
 
 
 def _change_of_frame(
-    horizontal: CRS, stated: np.ndarray, epochs: Epochs | None
+    horizontal: CRS, extent: np.ndarray, epochs: Epochs | None
 ) -> FrameChange | None:
     """How coordinates in an extent [2, 2 or more] get to ITRF2020 at the epoch of the images.
 
-    None: they are left to PROJ's way to WGS 84.
-
-    Raises InputError: as :func:`.frames.frame_change`.
+    None: they are left to PROJ's way to WGS 84. Raises InputError: as
+    :func:`.frames.frame_change`.
     """
-    geographic = _source(horizontal).geodetic_crs
-    if epochs is None or geographic is None or not np.isfinite(stated[:, :2]).all():
+    geographic = unbound(horizontal).geodetic_crs
+    if epochs is None or geographic is None or not np.isfinite(extent[:, :2]).all():
         return None
-    if (area := area_of(horizontal, stated)) is not None:
+    if (area := area_of(horizontal, extent)) is not None:
         place = (area[0] + area[2]) / 2, (area[1] + area[3]) / 2
     else:
-        place = degrees_of(horizontal, *stated[:, :2].mean(axis=0))
+        place = degrees_of(horizontal, *extent[:, :2].mean(axis=0))
         if place is None or not np.isfinite(place).all():
             return None
     return frame_change(geographic, place, *epochs)
@@ -217,26 +205,8 @@ def area_of(horizontal: CRS, extent: np.ndarray) -> tuple[float, float, float, f
     lon, lat = corners
     if not (np.abs(lon).max() < 179 and np.abs(lat).max() < 89):  # no inf, no NaN either
         return None
-    return (
-        math.floor(lon.min()),
-        math.floor(lat.min()),
-        math.floor(lon.max()) + 1,
-        math.floor(lat.max()) + 1,
-    )
-
-
-def _geoid_remedy(system: LidarCRS, extent: np.ndarray, datum: str) -> str:
-    """What to do about heights of a datum: the grid of the place that PROJ has of it."""
-    from .geoid_candidates import grid_of  # for refusals alone
-
-    text = "set geoid (--geoid) to a grid (GTX or GeoTIFF) of that datum"
-    place = degrees_of(system.horizontal, *extent[:, :2].mean(axis=0))
-    grid = None if place is None else grid_of(datum, *map(float, place))
-    if grid is None:
-        return text
-    if grid.path is not None:
-        return f"{text}: {grid.path}"
-    return f"{text}: {grid.grid}, which projsync --file {grid.grid} downloads"
+    low, high = ([math.floor(f(of)) for of in corners] for f in (np.min, np.max))
+    return low[0], low[1], high[0] + 1, high[1] + 1
 
 
 def to_wgs84(
@@ -273,20 +243,20 @@ def _surface_of_heights(
     system: LidarCRS, file: str | Path, extent: np.ndarray, geoid: str | Path | None, unit: str
 ) -> tuple[str | Path | None, list[str]]:
     """The geoid that heights of a file count from, None for the ellipsoid; and remarks."""
-    hint = DATUM_IN_NAME.search(Path(file).stem)
-    if system.vertical_datum and not geoid:
-        raise InputError(
-            f"heights are orthometric ('{system.vertical_datum}'), not ellipsoidal",
-            file=file,
-            remedy=_geoid_remedy(system, extent, system.vertical_datum),
-        )
-    if not system.has_vertical and hint and not geoid:
-        raise InputError(
-            f"declares no vertical datum, but its name says orthometric heights ({hint[1]})",
-            file=file,
-            remedy=f"{_geoid_remedy(system, extent, hint[1])}, or name the file otherwise if its "
-            "heights are ellipsoidal",
-        )
+    hint = DATUM_IN_NAME.search(Path(file).stem) if not system.has_vertical else None
+    if not geoid and (datum := system.vertical_datum or (hint and hint[1])):
+        from .geoid import grid_of  # for refusals alone
+
+        remedy = "set geoid (--geoid) to a grid (GTX or GeoTIFF) of that datum"
+        place = degrees_of(system.horizontal, *extent[:, :2].mean(axis=0))
+        if place is not None and (grid := grid_of(datum, *map(float, place))) is not None:
+            fetched = f"{grid.grid}, which projsync --file {grid.grid} downloads"
+            remedy += f": {grid.path or fetched}"
+        problem = f"heights are orthometric ('{datum}'), not ellipsoidal"
+        if hint:
+            problem = f"declares no vertical datum, but its name says orthometric heights ({datum})"
+            remedy += ", or name the file otherwise if its heights are ellipsoidal"
+        raise InputError(problem, file=file, remedy=remedy)
     if system.ellipsoidal and geoid:
         return None, ["the file declares ellipsoidal heights: the geoid is not applied to it"]
     if system.has_vertical:
@@ -314,20 +284,20 @@ def transformation(
     Raises InputError: a system that PROJ cannot transform, orthometric heights without a geoid, a
     dynamic frame without an epoch.
     """
+    horizontal = system.horizontal
     unit = system.vertical_unit or (
-        "metre" if system.horizontal.is_geographic else system.horizontal.axis_info[0].unit_name
+        "metre" if horizontal.is_geographic else horizontal.axis_info[0].unit_name
     )
     geoid, more = _surface_of_heights(system, file, extent, geoid, unit)
-    notes = [*notes, *more]
     if epochs is not None and system.epoch is not None:
         epochs = epochs._replace(own=system.epoch)
     try:
-        area = area_of(system.horizontal, extent)
-        change = _change_of_frame(system.horizontal, extent, epochs)
+        area = area_of(horizontal, extent)
+        change = _change_of_frame(horizontal, extent, epochs)
         if change is None:
-            transformer, remarks = _best_operation(system.horizontal, area)
+            transformer, remarks = _best_operation(horizontal, area)
         else:
-            source = _source(system.horizontal).to_3d()
+            source = unbound(horizontal).to_3d()
             transformer = pyproj.Transformer.from_crs(source, change.geographic, always_xy=True)
             remarks = list(change.notes)
     except InputError as error:
@@ -344,37 +314,36 @@ def transformation(
         place = transformer.transform(x, y, z)
         return place if change is None else change(*place)
 
-    operation, accuracy, frame = transformer.description, None, None
-    if transformer.accuracy >= 0:
-        accuracy = float(transformer.accuracy)
-    if epochs is not None and change is None:
-        frame = taken_as_it_is(_source(system.horizontal).geodetic_crs, epochs.images)
     if change is not None:
         operation, accuracy, frame = "; ".join(change.legs), change.accuracy_m, change.describe()
-    is_map = system.horizontal.is_projected
+    else:
+        operation, frame = transformer.description, None
+        accuracy = float(transformer.accuracy) if transformer.accuracy >= 0 else None
+        if epochs is not None:
+            frame = taken_as_it_is(unbound(horizontal).geodetic_crs, epochs.images)
     grid = None
     if geoid:
         from .geoid import GeoidGrid  # GDAL, which few scenes need
 
         grid = GeoidGrid(Path(geoid))
-    ellipsoid = system.horizontal.ellipsoid
-    modern = ellipsoid is not None and abs(ellipsoid.semi_major_metre - 6378137) < 1
-    if geoid:
         heights = f"orthometric ({system.vertical_datum or 'datum not declared'}), in {unit}"
     else:
         heights = f"ellipsoidal ({'declared' if system.ellipsoidal else 'assumed'}), in {unit}"
+    ellipsoid = horizontal.ellipsoid
+    modern = ellipsoid is not None and abs(ellipsoid.semi_major_metre - 6378137) < 1
+    smooth = PatchedTransform(exact, system.horizontal_unit_m) if horizontal.is_projected else exact
     return ToWGS84(
         system=system,
         operation=operation,
         accuracy_m=accuracy,
         heights=heights,
-        notes=tuple(notes + remarks),
+        notes=(*notes, *more, *remarks),
         area=area,
         frame=frame,
         change=change,
         exact=exact,
         _to_geodetic=transformer,
-        _transform=PatchedTransform(exact, system.horizontal_unit_m) if is_map else exact,
+        _transform=smooth,
         _geoid=grid,
         # H + N of a national geoid is in the file's datum, if that is on GRS 80 as all geoids are,
         # and goes through the datum transformation; above WGS 84 it is final.
@@ -396,21 +365,19 @@ def check_area(
     if area is None:
         return None
     wide = (area.east - area.west) % 360.0 or 360.0
-    middle = area.west + wide / 2
-    off = turn(np.array(lon) - middle)
-    across = float(np.abs(off).max()) - wide / 2
-    beyond = max(area.south - lat[0], lat[1] - area.north, across)
+    off = turn(np.array(lon) - (area.west + wide / 2))
+    beyond = max(area.south - lat[0], lat[1] - area.north, float(np.abs(off).max()) - wide / 2)
     if beyond <= 0.5:
         return None
     where = (
         f"points lie at longitude {lon[0]:.4f} to {lon[1]:.4f}, latitude {lat[0]:.4f} to "
         f"{lat[1]:.4f}, outside of the area of '{system.name}' ({area.name})"
     )
-    if beyond > 8:
-        raise InputError(
-            where,
-            file=file,
-            remedy="correct the coordinate system that is given (lidar_crs, --crs) or that the "
-            "file declares",
-        )
-    return where
+    if beyond <= 8:
+        return where
+    raise InputError(
+        where,
+        file=file,
+        remedy="correct the coordinate system that is given (lidar_crs, --crs) or that the file "
+        "declares",
+    )

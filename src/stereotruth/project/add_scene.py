@@ -19,7 +19,7 @@ from ..core.products.rasters import open_raster
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from ..lidar.catalogue_list import is_catalogue, write_list
-from ..lidar.overlap_check import apart, refuse_apart
+from ..lidar.lattice import apart, refuse_apart
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import rpc_file
 from .check_lidar import check_lidar

@@ -15,13 +15,12 @@ from ..core.job import in_own_process
 from ..core.products.remote_files import url_of
 from ..core.sheets import Scene
 from ..core.tables import epoch_year
-from ..lidar.footprint import Footprint
 from ..lidar.frames import Epoch, Epochs
-from ..lidar.geoid_candidates import candidates_at, named
-from ..lidar.ingest import ingest
+from ..lidar.geoid import candidates_at, named
+from ..lidar.ingest import SurveyedFile, ingest, survey
+from ..lidar.lattice import Footprint
 from ..lidar.point_store import PointStore
 from ..lidar.strip_comparison import compare_strips
-from ..lidar.survey import SurveyedFile, survey
 from .findings import Findings, Level
 
 MOST_POINTS = 6_000_000  # read and compared in seven seconds

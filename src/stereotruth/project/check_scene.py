@@ -24,10 +24,9 @@ from ..core.products.rasters import open_raster
 from ..core.sheets import Scene
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
-from ..lidar.footprint import Footprint
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
-from ..lidar.overlap_check import FAR, Box, apart, refuse_apart
-from ..lidar.survey import SurveyedFile
+from ..lidar.ingest import SurveyedFile
+from ..lidar.lattice import FAR, Box, Footprint, apart, refuse_apart
 from ..sensor.image_reader import MAX_PIXELS, Source, bands_of
 from .check_lidar import check_lidar, check_strips
 from .expected import Nodes, SceneFacts, check_frame, check_labels, pixel_m2

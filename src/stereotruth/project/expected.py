@@ -17,7 +17,7 @@ from ..core.errors import in_number
 from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.windows import summed_area, window_sums
 from ..epipolar.model import EpipolarModel
-from ..lidar.survey import SurveyedFile
+from ..lidar.ingest import SurveyedFile
 from ..tiles.windows import cell_step
 from .findings import Findings, Level
 

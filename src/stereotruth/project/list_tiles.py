@@ -18,7 +18,7 @@ from ..core.products.remote_files import bring_image, is_remote, state_of
 from ..lidar.catalogue import Cover, Tile, cover_of, read_catalogue, resolved
 from ..lidar.catalogue_list import SUFFIX, ListedTile, TileList, write_list
 from ..lidar.declared_crs import LidarCRS, interpret
-from ..lidar.footprint import CELL_DEG
+from ..lidar.lattice import CELL_DEG
 from .check import chosen
 from .project import configured, read_rows, sheet
 

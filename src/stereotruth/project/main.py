@@ -125,7 +125,9 @@ def init(
 ) -> None:
     """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
     if twin is not None:
-        from .simulated_project import DENSITY, SUN_DEG, Options, with_twin
+        from stereocities.twin_world import SUN_DEG
+
+        from .simulated_project import DENSITY, Options, with_twin
 
         to: Path | str = folder or Path("twin")
         options = Options(crs, density or DENSITY, sun or SUN_DEG, size, rpc)

@@ -15,8 +15,8 @@ from rich.markup import escape
 from ..core import sheets
 from ..core.config.configuration import Configuration
 from ..core.errors import InputError
+from ..lidar.point_statistics import roughness_m
 from ..lidar.point_store import PointStore
-from ..lidar.roughness import roughness_m
 from ..sensor.linked_images import Links, Names, new_links
 from ..sensor.pair_light import DIACHRONIC_DAYS
 from ..sensor.pair_quality import USUAL_ROUGHNESS_M, RatedPair, rate

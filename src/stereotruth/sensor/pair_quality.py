@@ -9,8 +9,8 @@ pairs match less, narrow pairs tell less: the best lie between, at 10 to 30° in
 ``matched`` is the share of the pixels that both images show whose disparity semi-global matching
 finds within 1 px. Its log odds fall with the base over the height (what stands up looks different
 from its sides, and steps along the rows grow), with the way of the shadows between the images, and
-with the roughness of the site (:func:`stereotruth.lidar.roughness.roughness_m`), as far as its
-LiDAR has been read. The roughness is that of all pairs of a site and orders none of them. The
+with the roughness of the site (:func:`stereotruth.lidar.point_statistics.roughness_m`), as far as
+its LiDAR has been read. The roughness is that of all pairs of a site and orders none of them. The
 coefficients are fitted, and the prediction is tested on other sites, by ``bench/pairs.py``;
 the ratio of the pixel sizes, the days between the images, their season, the asymmetry and the
 obliqueness of the pair explained nothing beside them there. What the simulated sites lack, clouds,

@@ -28,9 +28,8 @@ from ..core.products.files import atomic_file, atomic_folder, link, sealed
 from ..core.products.making import FileLock, marks_of_inputs, refuse_replaced
 from ..core.products.provenance import describe, digest
 from ..core.products.resumable_grids import Ledger
-from ..lidar.density import points_per_m2
-from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
-from ..lidar.overlap_check import refuse_apart
+from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, refuse_apart
+from ..lidar.point_statistics import points_per_m2
 from ..lidar.point_store import PointStore
 from .scale import PART, SurfaceScale
 from .shown_blocks import Box, Number, ShownBlocks, ShownGround

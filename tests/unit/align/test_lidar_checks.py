@@ -24,7 +24,7 @@ from stereotruth.align.lidar_checks import (
     lines_of_sight,
 )
 from stereotruth.align.refine import refine
-from stereotruth.lidar import geoid_candidates
+from stereotruth.lidar import geoid
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 
@@ -83,7 +83,7 @@ def installed(tmp_path, monkeypatch):
         name: write_gtx(tmp_path / f"{name}.gtx", np.full((9, 9), value), 112.0, 28.0, 0.5)
         for name, value in values.items()
     }
-    monkeypatch.setattr(geoid_candidates, "_installed", places.get)
+    monkeypatch.setattr(geoid, "_installed", places.get)
 
 
 def test_orthometric_heights_taken_as_ellipsoidal_fit_their_geoid(tmp_path, installed):

@@ -13,8 +13,8 @@ from stereotruth.align.pair_ground import footprint_of, pair_outlines
 from stereotruth.align.tie_sites import choose_sites
 from stereotruth.core.products.grids import open_grid
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.lidar.footprint import CELL_DEG, Footprint
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.lattice import CELL_DEG, Footprint
 from stereotruth.lidar.point_store import PointStore
 
 from ...synthetic.box_scene import HALF, ROOF, SIZE, UTM, project_with, surfaces_of

@@ -12,7 +12,7 @@ from stereotruth.align.strip_uncertainty import SQUARE_DEG, with_strips
 from stereotruth.core.numerics.geometry import exact_metres_per_degree
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.lidar.point_store import SQUARES
-from stereotruth.lidar.strip_offsets import SHARE, Strip, StripKey, StripOffsets
+from stereotruth.lidar.strips import SHARE, Strip, StripKey, StripOffsets
 
 from ...synthetic.cameras import HEIGHT
 from ...synthetic.textured_pair import NONE, SIZE, start

@@ -12,7 +12,7 @@ from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.status import is_labelled
 from stereotruth.labels.scene_inputs import SceneInputs
-from stereotruth.lidar.gps_times import day_of
+from stereotruth.lidar.point_fields import day_of
 from stereotruth.lidar.point_store import open_stores
 from stereotruth.surface.make_surface import make_surface
 

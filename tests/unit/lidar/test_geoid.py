@@ -1,17 +1,16 @@
-"""Geoid grids against PROJ."""
+"""Geoid grids against PROJ, and the geoids that PROJ's register has of a place."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import sqlite3
 
 import numpy as np
 import pyproj
 import pytest
-import rasterio
-from rasterio.transform import from_origin
 
 from stereotruth.core.errors import InputError
 from stereotruth.lidar import geoid
+from stereotruth.lidar.geoid import candidates_at, fits, grid_of, named
 
 from ...synthetic.las import write_gtx
 
@@ -20,9 +19,6 @@ def undulations(west: float, south: float, step: float, shape: tuple[int, int]) 
     lat = south + step * np.arange(shape[0])[:, None]
     lon = west + step * np.arange(shape[1])
     return 20 + 8 * np.sin(np.radians(7 * lon)) * np.cos(np.radians(5 * lat))
-
-
-# ------------------------------------------------------------------ geoid grids
 
 
 @pytest.mark.parametrize("west", [-124.0, 236.0])
@@ -61,60 +57,63 @@ def test_geoid_reads_more_rows_as_chunks_ask(tmp_path) -> None:
     lon, lat = np.full(200, 1.23), np.linspace(40, 50, 200)
     order = np.random.default_rng(0).permutation(200)
     one_by_one = np.array([grid(lon[k : k + 1], lat[k : k + 1])[0] for k in order])
-    at_once = geoid.GeoidGrid(grid.path)(lon, lat)
-    np.testing.assert_array_equal(one_by_one, at_once[order])
+    np.testing.assert_array_equal(one_by_one, geoid.GeoidGrid(grid.path)(lon, lat)[order])
 
 
-@pytest.mark.parametrize("problem", ["outside", "nodata"])
-def test_points_without_undulation_are_refused(tmp_path, problem) -> None:
+@pytest.mark.parametrize("lon", [11.2, 10.51])  # outside, beside a node without a value
+def test_points_without_undulation_are_refused(tmp_path, lon) -> None:
     values = undulations(10.0, 40.0, 0.1, (11, 11))
-    if problem == "nodata":
-        values[5, 5] = np.nan
+    values[5, 5] = np.nan
     grid = geoid.GeoidGrid(write_gtx(tmp_path / "small.gtx", values, 10.0, 40.0, 0.1))
-    lon = np.array([10.1, 10.51 if problem == "nodata" else 11.2])
-    with pytest.raises(InputError, match=r"small\.gtx.* 1 points|1 points .*small\.gtx"):
-        grid(lon, np.array([40.1, 40.51]))
-
-
-def geotiff(path: Path, values: np.ndarray, system: str, scale: float = 1.0) -> Path:
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        width=values.shape[1],
-        height=values.shape[0],
-        count=1,
-        dtype="int16" if scale != 1 else "float32",
-        crs=system,
-        transform=from_origin(9.95, 41.05, 0.1, 0.1),  # nodes from 10.0, 41.0
-        nodata=-9999,
-    ) as grid:
-        grid.write((values / scale).astype(grid.dtypes[0]), 1)
-        grid.scales = (scale,)
-    return path
-
-
-def test_geotiff_grid_with_scale(tmp_path) -> None:
-    values = np.round(undulations(10.0, 40.0, 0.1, (11, 11))[::-1], 2)
-    plain = geoid.GeoidGrid(geotiff(tmp_path / "a.tif", values, "EPSG:4326"))
-    scaled = geoid.GeoidGrid(geotiff(tmp_path / "b.tif", values, "EPSG:4326", scale=0.01))
-    lon, lat = np.array([10.0, 10.33, 11.0]), np.array([41.0, 40.77, 40.0])
-    np.testing.assert_allclose(plain(lon[[0, 2]], lat[[0, 2]]), [values[0, 0], values[-1, -1]])
-    np.testing.assert_allclose(plain(lon, lat), scaled(lon, lat), atol=0.011)
-
-
-@pytest.mark.parametrize(
-    ("system", "reason"), [("EPSG:32632", "longitude and latitude"), ("EPSG:4314", "Bessel")]
-)
-def test_grids_of_other_kinds_are_refused(tmp_path, system, reason) -> None:
-    grid = geotiff(tmp_path / "a.tif", np.zeros((11, 11)), system)
-    with pytest.raises(InputError, match=reason):
-        geoid.GeoidGrid(grid)
+    with pytest.raises(InputError) as error:
+        grid(np.array([10.1, lon]), np.array([40.1, 40.51]))
+    assert "small.gtx" in str(error.value) and "1 points" in str(error.value)
 
 
 def test_missing_or_broken_grid_is_named(tmp_path) -> None:
-    with pytest.raises(InputError, match=r"none\.gtx"):
-        geoid.GeoidGrid(tmp_path / "none.gtx")
     (tmp_path / "bad.gtx").write_bytes(b"not a grid")
-    with pytest.raises(InputError, match=r"bad\.gtx"):
-        geoid.GeoidGrid(tmp_path / "bad.gtx")
+    for name in ("none.gtx", "bad.gtx"):
+        with pytest.raises(InputError, match=name):
+            geoid.GeoidGrid(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("place", "surface", "grid"),
+    [
+        ((5.4, 43.3), "NGF-IGN69 height", "fr_ign_RAF20.tif"),
+        ((8.5, 47.4), "LN02 height", "ch_swisstopo_chgeo2004_ETRS89_LN02.tif"),
+        ((179.9, -17.0), "EGM2008 height", "us_nga_egm08_25.tif"),
+    ],
+)
+def test_the_geoids_of_a_place(place, surface, grid):
+    candidates = candidates_at(*place)
+    assert (surface, grid) in {(one.surface, one.grid) for one in candidates}
+    assert len(candidates) <= 4
+    assert f"{surface} ({grid}, not on this machine)" in named(candidates)
+
+
+def test_grids_that_are_not_here_are_named_only():
+    text = fits(-48.0, 5.4, 43.3)
+    assert "ellipsoidal 48.0 m; of the place as well: NGF-IGN69 height (fr_ign_RAF20.tif" in text
+
+
+def test_a_register_that_cannot_be_read_gives_no_names(monkeypatch):
+    def damaged(*_, **__):
+        raise sqlite3.DatabaseError
+
+    monkeypatch.setattr(geoid.sqlite3, "connect", damaged)
+    assert candidates_at(5.4, 43.3) == [] and fits(1.0, 5.4, 43.3) == ""
+
+
+@pytest.mark.parametrize(
+    ("datum", "place", "grid"),
+    [
+        ("NAVD88 height (ftUS)", (-122.6, 45.5), "us_noaa_g2018u0.tif"),
+        ("IGN69", (5.4, 43.3), "fr_ign_RAF20.tif"),
+        ("NAVD88 height", (5.4, 43.3), None),  # of another continent
+        ("height", (5.4, 43.3), None),
+    ],
+)
+def test_the_grid_of_a_datum_that_is_declared(datum, place, grid):
+    found = grid_of(datum, *place)
+    assert (None if found is None else found.grid) == grid

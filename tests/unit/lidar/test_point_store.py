@@ -11,8 +11,8 @@ import pyproj
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.numerics.geometry import DEGREE_M
-from stereotruth.lidar import lattice, point_store
+from stereotruth.core.products.files import sealed
+from stereotruth.lidar import point_store
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import (
     ATTRIBUTES,
@@ -25,8 +25,6 @@ from stereotruth.lidar.point_store import (
 )
 
 from ...synthetic.las import SOUTH, WEST, everything, write_las
-
-# ------------------------------------------------------------------ queries
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +49,24 @@ def test_query_is_exact_inclusive_and_in_stored_order(store) -> None:
             assert np.array_equal(getattr(part, name), getattr(got, name)[inside])
         lowest, highest = store.height_range(lon_min, lat_min, lon_max, lat_max)
         assert lowest <= part.height.min() <= part.height.max() <= highest
+    parts = [store.points_of(cell) for cell in range(store.cell_row.size)]
+    assert [len(part) for part in parts] == store.cell_counts.tolist()
+    assert np.array_equal(np.concatenate([part.h_q for part in parts]), got.h_q)
+    assert np.array_equal(store.square_counts.sum(axis=(1, 2)), store.cell_counts)
+
+
+def test_only_whole_point_stores_of_this_format_open(store, tmp_path) -> None:
+    with pytest.raises(InputError):
+        PointStore(tmp_path / "none.points")
+    attrs = json.loads((store.path / ATTRIBUTES).read_text())
+    for number, other in enumerate(({"kind": "grid"}, {"format": 0}, {"source": "b.laz"})):
+        shutil.copytree(store.path, tmp_path / str(number))
+        file = tmp_path / str(number) / ATTRIBUTES
+        sealed_anew = number < 2  # of another kind or format; else edited
+        values = {k: v for k, v in attrs.items() if k != "digest"} | other
+        file.write_text(sealed(values) if sealed_anew else json.dumps(attrs | other))
+        with pytest.raises(InputError):
+            PointStore(tmp_path / str(number))
 
 
 def test_edges_between_lattice_points(store) -> None:
@@ -58,72 +74,10 @@ def test_edges_between_lattice_points(store) -> None:
     assert len(store.query(lon, lat, lon, lat)) == 1
     assert len(store.query(np.nextafter(lon, 180), lat, lon + 4e-10, lat)) == 0
     assert len(store.query(-np.inf, -np.inf, np.inf, np.inf)) == store.count
-
-
-def test_empty_queries(store) -> None:
-    lon_min, lat_min, lon_max, lat_max = store.bounds[:4]
-    for box in [
-        (lon_max + 1, lat_min, lon_max + 2, lat_max),
-        (lon_min, lat_max + 1e-8, lon_max, lat_max + 1),
-        (lon_max, lat_max, lon_min, lat_min),
-    ]:
-        got = store.query(*box)
-        assert len(got) == len(got.lon) == 0
-        assert got.h_q.dtype == np.int64
-    assert store.height_range(10, 10, 11, 11) is None
-    assert len(query_points([], 0, 0, 1, 1)) == 0
-
-
-def boxes_of(*stores: PointStore) -> np.ndarray:
-    """(lon_min, lat_min, lon_max, lat_max) of the cells that hold points, each once."""
-    cells = [np.stack([store.cell_row, store.cell_col], axis=1) for store in stores]
-    size = (1 << lattice.CELL_BITS) / lattice.PER_DEG
-    corner = np.unique(np.concatenate(cells), axis=0)[:, ::-1] * size
-    return np.hstack([corner, corner + size])
-
-
-def test_two_stores_hold_what_one_does(tmp_path) -> None:
-    """Split a file in two: the same points, and the same exact sums in either order."""
-    xyz = write_las(tmp_path / "all.laz", 4000)
-    write_las(tmp_path / "a.laz", xyz=xyz[:1500])
-    write_las(tmp_path / "b.laz", xyz=xyz[1500:])
-    for name in ("all", "a", "b"):
-        ingest(tmp_path / f"{name}.laz", tmp_path / f"{name}.points")
-    whole = PointStore(tmp_path / "all.points")
-    lon_min, lat_min, lon_max, lat_max = whole.bounds[:4]
-    box = (lon_min, lat_min, (lon_min + lon_max) / 2, (lat_min + lat_max) / 2)
-    expected = whole.query(*box)
-    for names in ("ab", "ba"):
-        got = query_points([tmp_path / f"{name}.points" for name in names], *box)
-        assert len(got) == len(expected) > 500
-        for name in ("lon_q", "lat_q", "h_q"):
-            assert np.array_equal(np.sort(getattr(got, name)), np.sort(getattr(expected, name)))
-    parts = [PointStore(tmp_path / f"{name}.points") for name in "ab"]
-    assert sum(part.attrs["points"]["kept"] for part in parts) == 4000
-    bounds = np.array([part.bounds for part in parts])
-    outermost = (f(bounds[:, k]) for k, f in enumerate([np.min] * 2 + [np.max] * 2))
-    assert (*outermost, bounds[:, 4].min(), bounds[:, 5].max()) == whole.bounds
-    boxes = boxes_of(whole)
-    assert np.array_equal(boxes_of(*parts), boxes)
-    width = (boxes[:, 2] - boxes[:, 0]) * np.cos(np.radians(boxes[:, 1]))
-    covered_m2 = (width * (boxes[:, 3] - boxes[:, 1])).sum() * DEGREE_M**2
-    assert covered_m2 == pytest.approx(0.49e6, abs=0.2e6)  # whole cells
-    inside = (expected.lon[:, None] >= boxes[:, 0]) & (expected.lon[:, None] < boxes[:, 2])
-    inside &= (expected.lat[:, None] >= boxes[:, 1]) & (expected.lat[:, None] < boxes[:, 3])
-    assert (inside.sum(axis=1) == 1).all()
-
-
-def test_only_point_stores_open(tmp_path) -> None:
-    with pytest.raises(InputError, match="no such"):
-        PointStore(tmp_path / "none.points")
-    write_las(tmp_path / "a.laz")
-    ingest(tmp_path / "a.laz", tmp_path / "a.points")
-    file = tmp_path / "a.points" / ATTRIBUTES
-    attrs = json.loads(file.read_text())
-    for other, match in (({"kind": "grid"}, "no point store"), ({"format": 0}, "of format 0")):
-        file.write_text(json.dumps(attrs | other))
-        with pytest.raises(InputError, match=match):
-            PointStore(tmp_path / "a.points")
+    west, south, east, north = store.bounds[:4]
+    assert len(store.query(west, north + 1e-8, east, north + 1)) == 0
+    assert len(store.query(east, north, west, south)) == 0
+    assert store.height_range(10, 10, 11, 11) is None and len(query_points([], 0, 0, 1, 1)) == 0
 
 
 def test_arrays_are_what_the_module_says(tmp_path) -> None:
@@ -160,7 +114,7 @@ def test_every_damaged_byte_of_the_arrays_is_told(store, tmp_path) -> None:
         size = len(good[name])
         first = size - np.load(store.path / name).nbytes
         spoilt = []
-        for at in [0, first, size - 1, *rng.integers(first, size, 30)]:
+        for at in [0, first, size - 1, *rng.integers(first, size, 12)]:
             data = bytearray(good[name])
             data[at] ^= 1 << rng.integers(8)
             spoilt.append(bytes(data))
@@ -176,15 +130,11 @@ def test_every_damaged_byte_of_the_arrays_is_told(store, tmp_path) -> None:
         folder = tmp_path / f"without {name}"
         shutil.copytree(store.path, folder)
         (folder / name).unlink()
-        with pytest.raises(InputError, match="Remedy"):
+        with pytest.raises(InputError):
             PointStore(folder)
-    (tmp_path / "text").mkdir()
-    (tmp_path / "text" / ATTRIBUTES).write_bytes(good[ATTRIBUTES][:-9])
-    with pytest.raises(InputError, match=f"{ATTRIBUTES}: damaged"):
-        PointStore(tmp_path / "text")
 
 
-@pytest.mark.parametrize("piece", [1, 7, 1000])
+@pytest.mark.parametrize("piece", [7, 1000])
 def test_pieces_leave_no_trace(store, monkeypatch, piece) -> None:
     """Cells that fit into a piece, that fill several, that end with one."""
     west, south, east, north = store.bounds[:4]
@@ -195,16 +145,6 @@ def test_pieces_leave_no_trace(store, monkeypatch, piece) -> None:
     assert len(expected) > 1000
     for name in Points.__dataclass_fields__:
         assert np.array_equal(getattr(found, name), getattr(expected, name))
-
-
-def test_a_query_reads_its_cells_only(store, monkeypatch) -> None:
-    """A damaged cell does no harm to those that do not ask for it."""
-    boxes = boxes_of(store)
-    monkeypatch.setattr(store, "_crc32", [0, *store._crc32[1:]])
-    far = boxes[-1] - [-1e-8, -1e-8, 1e-8, 1e-8]
-    assert len(store.query(*far)) > 0
-    with pytest.raises(InputError, match="damaged"):
-        store.query(*boxes[0])
 
 
 def test_files_of_a_scene_share_one_way_to_wgs84(tmp_path) -> None:

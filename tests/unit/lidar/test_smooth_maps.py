@@ -36,17 +36,10 @@ def transformer(epsg: int) -> tuple[pyproj.Transformer, float]:
 
 SYSTEMS = [  # code, easting, northing in map units
     (32650, 347_000, 3_345_000),
-    (32719, 320_000, 6_250_000),
-    (2154, 700_000, 6_600_000),
-    (2975, 340_000, 7_650_000),
     (21781, 600_000, 200_000),  # Bessel: place and height change with height
-    (28992, 120_000, 450_000),
     (2992, 636_000, 849_000),  # feet
-    (2225, 6_000_000, 2_100_000),  # survey feet
     (3857, 13_000_000, 3_500_000),
-    (3035, 4_300_000, 3_200_000),
     (5514, -700_000, -1_050_000),
-    (2436, 500_000, 3_400_000),
 ]
 
 
@@ -111,21 +104,6 @@ def test_places_that_proj_does_not_know() -> None:
     good = np.isfinite(got).all(axis=0)
     assert good.tolist() == [True, False, False, False, False, False, True]
     assert got[2][6] == 1e7
-
-
-def test_near_a_pole_of_the_map() -> None:
-    exact, unit = transformer(3413)
-    points = scattered(0, 0, unit, 2000)
-    assert np.array_equal(
-        np.array(PatchedTransform(exact.transform, unit)(*points)),
-        np.array(exact.transform(*points)),
-    )
-
-
-def test_no_points() -> None:
-    exact, unit = transformer(32650)
-    got = PatchedTransform(exact.transform, unit)(*np.empty((3, 0)))
-    assert [values.shape for values in got] == [(0,)] * 3
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +179,7 @@ def test_where_no_polynomial_fits_the_model_is_taken() -> None:
     assert np.abs(local.at_points(*lattice) - exact(model, lattice)).max() < TOLERANCE_PX
     sums = np.vstack([np.ones(3000, np.int64), lattice]).T.copy()
     sums[3] = 0
+    found = local.at_means(sums)
     known = sums[:, 0] > 0
-    found, expected = local.at_means(sums), exact(model, lattice)
-    assert np.abs(found - expected)[:, known].max() < TOLERANCE_PX
+    assert np.abs(found - exact(model, lattice))[:, known].max() < TOLERANCE_PX
     assert np.isnan(found[:, 3]).all()

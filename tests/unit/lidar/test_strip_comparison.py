@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.lattice import Footprint
 from stereotruth.lidar.point_store import STRIPS, PointStore
-from stereotruth.lidar.strip_codes import runs_of
 from stereotruth.lidar.strip_comparison import compare_strips
-from stereotruth.lidar.strip_moves import move_strips
-from stereotruth.lidar.strip_offsets import StripOffsets
+from stereotruth.lidar.strips import StripOffsets, move_strips
 
 from ...synthetic.stores import content_of
 from ...synthetic.strips import OFFSETS, stores
@@ -53,22 +51,16 @@ def test_order_and_cut_of_the_files_play_no_part(made, tmp_path):
     assert whole.to_dict() == found.to_dict()
 
 
-def test_strips_that_agree_are_not_named(tmp_path):
-    found = compare_strips(stores(tmp_path, np.zeros((3, 3))))
+def test_strips_that_agree_or_are_one_or_do_not_overlap_are_not_named(tmp_path, monkeypatch):
+    found = compare_strips(stores(tmp_path / "agree", np.zeros((3, 3))))
     assert not found.named and not found.sentence
     for strip in found.strips:
         assert abs(strip.offset_m[2]) < HEIGHT_M and strip.chance > 0.01
-
-
-def test_of_one_strip_nothing_is_said(tmp_path):
-    found = compare_strips(stores(tmp_path, told="nothing"))
+    found = compare_strips(stores(tmp_path / "one", told="nothing"))
     assert found.report() is None and not found.sentence
-    assert not (tmp_path / "south.points" / STRIPS).exists()
-
-
-def test_strips_without_overlap_are_compared_with_nothing(tmp_path, monkeypatch):
+    assert not (tmp_path / "one" / "south.points" / STRIPS).exists()
     monkeypatch.setattr("tests.synthetic.strips.STEP", 130.0)
-    found = compare_strips(stores(tmp_path))
+    found = compare_strips(stores(tmp_path / "apart"))
     assert len(found.strips) == 3 and not found.named
     assert {strip.tied_to for strip in found.strips} == {""}
 
@@ -93,16 +85,12 @@ def test_a_record_is_read_as_it_was_written(made, tmp_path):
     assert read.to_dict() == found.to_dict() and np.array_equal(read.shares, found.shares)
     rows = read.report()["strips"]
     assert sum(row["beyond_noise"] for row in rows) == 2 and rows[0]["off"] == rows[0]["strip"]
-
-
-def test_how_far_strips_are_off_in_plan(made):
-    """From the mean of all by their ground; nothing of points that are moved."""
-    found = compare_strips(made)
-    ground = np.array([strip.ground_m2 for strip in found.strips])
-    plan = OFFSETS[[int(strip.name) - 7320 for strip in found.strips], :2]
+    # how far strips are off in plan, from the mean of all by their ground
+    ground = np.array([strip.ground_m2 for strip in read.strips])
+    plan = OFFSETS[[int(strip.name) - 7320 for strip in read.strips], :2]
     far = np.hypot(*(plan - ground @ plan / ground.sum()).T).max()
-    assert abs(found.most_in_plan_m - far) < PLAN_M
-    assert replace(found, taken_out=True).most_in_plan_m == 0.0
+    assert abs(read.most_in_plan_m - far) < PLAN_M
+    assert replace(read, taken_out=True).most_in_plan_m == 0.0
 
 
 def test_a_part_of_a_file_has_the_strips_of_the_whole(made, tmp_path):
@@ -134,8 +122,3 @@ def test_damaged_strips_are_refused(made, tmp_path):
             PointStore(store.path).strips_of(0)
     finally:
         file.write_bytes(data)
-
-
-def test_runs_of_time_end_where_no_point_was_measured():
-    assert runs_of([3, 4, 5, 8, 9, 20]).tolist() == [3, 3, 3, 8, 8, 20]
-    assert runs_of([]).size == 0

@@ -7,9 +7,8 @@ import pytest
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import read_sealed
-from stereotruth.lidar.footprint import Footprint
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.lattice import LATTICE_DEG
+from stereotruth.lidar.lattice import LATTICE_DEG, Footprint
 from stereotruth.lidar.point_store import PointStore, open_stores
 from stereotruth.surface import make_surface as module
 from stereotruth.surface.delaunay import MAX_PARTS

@@ -1,4 +1,6 @@
-"""What each strip of a site's LiDAR is off, and where its points lie: a folder.
+"""What each strip of a site's LiDAR is off, where its points lie, and points moved by that.
+
+The record of strips is a folder:
 
 ==============  ==================================================================================
 ``strips.json`` strips by name, with ground, offset and covariance, chance, and a digest
@@ -8,24 +10,30 @@
 
 from __future__ import annotations
 
+import logging
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.numerics.geometry import exact_metres_per_degree
 from ..core.products.files import atomic_folder, read_record, sealed
-from .point_store import SQUARES
+from .cell_sort import SCRATCH_POINTS, SortedRuns, bounds_of
+from .lattice import CELL_BITS, CELL_DEG, PER_DEG, PER_M
+from .point_fields import EDGES, NO_LIMITS, SOURCE, day_of
+from .point_store import SQUARES, PointStore
 
+log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
 
 RECORD, SHARES = "strips.json", "shares.npy"
-AXES = "east", "north", "up"
 MOST_TOLD = 8  # strips in a sentence
 SHARE = np.dtype(
     [("row", "<i4"), ("col", "<i4"), ("strip", "<u2"), ("points", "<u2", (SQUARES, SQUARES))]
@@ -123,22 +131,18 @@ class StripOffsets:
             row: dict[str, Any] = {"strip": strip.name, "told_by": strip.key.by}
             row["ground_km2"] = round(strip.ground_m2 / 1e6, 4)
             row["off"] = strip.tied_to
-            for name, value, sigma in zip(AXES, strip.offset_m, strip.sigma_m):
-                free = strip.tied_to not in ("", strip.name)
-                row[f"{name}_m"] = round(value, 4) if free else None
-                row[f"{name}_sigma_m"] = round(float(sigma), 4) if free else None
+            is_free = strip.tied_to not in ("", strip.name)
+            for name, value, sigma in zip(("east", "north", "up"), strip.offset_m, strip.sigma_m):
+                row[f"{name}_m"] = round(value, 4) if is_free else None
+                row[f"{name}_sigma_m"] = round(float(sigma), 4) if is_free else None
             row["beyond_noise"] = strip.named
             rows.append(row)
         return {"sentence": self.sentence, "taken_out": self.taken_out, "strips": rows}
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready, without the shares."""
-        return {
-            "kind": "strips",
-            "units": UNITS,
-            "taken_out": self.taken_out,
-            "strips": [asdict(strip) for strip in self.strips],
-        }
+        strips = [asdict(strip) for strip in self.strips]
+        return {"kind": "strips", "units": UNITS, "taken_out": self.taken_out, "strips": strips}
 
     def write(self, folder: str | Path, provenance: Mapping[str, Any] | None = None) -> None:
         """Write the folder; it appears when it is whole."""
@@ -174,3 +178,58 @@ class StripOffsets:
             return cls(strips, np.load(BytesIO(data)), values["taken_out"])
 
         return read_record(folder / RECORD, made, what="record of strips", stage="strips")
+
+
+def more_of(store: PointStore, day: int) -> str:
+    """What tells the strip of a point besides its code: the file for numbers within it, and the day
+    for ``point_source_id``, which each survey counts anew."""
+    if store.strips_by == EDGES:
+        return store.path.stem
+    return day_of(day) if day and store.strips_by == SOURCE else ""
+
+
+def move_strips(
+    store: str | Path,
+    strips: StripOffsets,
+    out: str | Path,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a point store whose points are those of ``store`` less the offsets of their strips.
+
+    Strips that are not named stay where they are. Raises InputError if the store is damaged.
+    """
+    source = PointStore(store)
+
+    def offset_m(code: int, day: int) -> tuple[float, float, float]:
+        more = more_of(source, day)
+        for strip in strips.named:
+            key = strip.key
+            if key.by == source.strips_by and key.first <= code <= key.last and key.more == more:
+                return strip.offset_m
+        return 0.0, 0.0, 0.0
+
+    limits, moved = NO_LIMITS.copy(), 0
+    with atomic_folder(out) as unfinished, TemporaryFile(dir=unfinished.parent) as disk:
+        runs = SortedRuns.of(min(SCRATCH_POINTS, source.count), disk)
+        for cell in range(source.cell_row.size):
+            words, points = source.words_of(cell), source.points_of(cell)
+            codes = source.strips_of(cell)
+            pairs = codes.astype(np.int64) << 16 | points.day
+            distinct, which = np.unique(pairs, return_inverse=True)
+            offsets = np.array([offset_m(int(p >> 16), int(p & 0xFFFF)) for p in distinct])
+            moved += int(offsets.any(axis=1)[which].sum())
+            low, high = source.cell_heights[cell] / PER_M
+            lat = float(source.cell_row[cell] + 0.5) * CELL_DEG
+            metres = np.array([*exact_metres_per_degree(lat, float(low + high) / 2), 1.0])
+            steps = offsets.T / metres[:, None] * np.array([[PER_DEG], [PER_DEG], [PER_M]])
+            lattice = np.stack([points.lon_q, points.lat_q, points.h_q])
+            lattice -= np.rint(steps).astype(np.int64)[:, which]
+            limits[0] = np.minimum(limits[0], lattice.min(axis=1))
+            limits[1] = np.maximum(limits[1], lattice.max(axis=1))
+            attributes = words[:, 0] >> CELL_BITS | words[:, 1] >> CELL_BITS << 16
+            runs.add(lattice, attributes, codes.astype(np.uint32))
+        attrs = dict(source.attrs)
+        attrs["bounds"] = bounds_of(limits) if source.count else list(source.bounds)
+        attrs["provenance"] = dict(provenance or {})
+        runs.write(unfinished, attrs, 0 if len(source.strip_counts) > 1 else None)
+    log.info("%s: %d of %d points moved", source.path.name, moved, source.count)

@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from stereotruth.lidar.footprint import Footprint
-from stereotruth.lidar.gps_times import days_by_code, number_of
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import PointStore, query_points
+from stereotruth.lidar.lattice import Footprint
+from stereotruth.lidar.point_fields import days_by_code, number_of, runs_of
+from stereotruth.lidar.point_store import PointStore
 
 from ...synthetic.las import adjusted, everything, write_las
 from ...synthetic.stores import content_of, part_of
@@ -24,31 +24,22 @@ def seconds(day: str) -> float:
     return (noon - datetime(1980, 1, 6, tzinfo=UTC)).total_seconds() + GPS_LESS_UTC_S - 1e9
 
 
-def with_times(file, times, *, absolute: bool, pdrf: int = 6):
-    write_las(file, len(times), pdrf=pdrf, gps_time=times, absolute=absolute)
-    return file
-
-
-@pytest.mark.parametrize("name", ["a.las", "a.laz"])
-@pytest.mark.parametrize("pdrf", [1, 3, 6, 7])
-def test_days_follow_from_absolute_times(tmp_path, name, pdrf):
-    times = np.linspace(seconds("2019-05-04"), seconds("2019-05-09"), 3000)
+@pytest.mark.parametrize(("name", "pdrf"), [("a.las", 1), ("a.laz", 6)])
+@pytest.mark.parametrize("first", ["2007-03-01", "2019-05-04"])  # adjusted time of both signs
+def test_days_follow_from_absolute_times(tmp_path, name, pdrf, first):
+    times = np.linspace(seconds(first), seconds(first) + 5 * 86400, 3000)
     times[::7] = 0.0  # never filled in
-    file = with_times(tmp_path / name, times, absolute=True, pdrf=pdrf)
-    found = ingest(file, tmp_path / "s.points", acquired=("2001-01-01", "2001-01-02"))["acquired"]
-    assert found == {"start": "2019-05-04", "end": "2019-05-09", "by": "GPS time of the points"}
+    write_las(tmp_path / name, 3000, pdrf=pdrf, gps_time=times, absolute=True)
+    catalogue = ("2001-01-01", "2001-01-02")
+    found = ingest(tmp_path / name, tmp_path / "s.points", acquired=catalogue)["acquired"]
+    last = f"{first[:8]}{int(first[8:]) + 5:02d}"
+    assert found == {"start": first, "end": last, "by": "GPS time of the points"}
 
 
-def test_times_before_the_epoch_of_adjusted_time(tmp_path):
-    file = with_times(tmp_path / "a.laz", np.full(3000, seconds("2007-03-01")), absolute=True)
-    assert ingest(file, tmp_path / "s.points")["acquired"]["start"] == "2007-03-01"
-
-
-@pytest.mark.parametrize(
-    ("times", "absolute"), [(np.full(3000, 3e5), False), (np.zeros(3000), True)]
-)
-def test_a_catalogue_tells_where_points_do_not(tmp_path, times, absolute):
-    file = with_times(tmp_path / "a.laz", times, absolute=absolute)
+@pytest.mark.parametrize(("time", "absolute"), [(3e5, False), (0.0, True)])
+def test_a_catalogue_tells_where_points_do_not(tmp_path, time, absolute):
+    file = tmp_path / "a.laz"
+    write_las(file, 3000, gps_time=np.full(3000, time), absolute=absolute)
     found = ingest(file, tmp_path / "s.points", acquired=("2020-01-01", "2020-02-01"))["acquired"]
     assert found == {"start": "2020-01-01", "end": "2020-02-01", "by": "catalogue"}
     assert ingest(file, tmp_path / "t.points")["acquired"] is None
@@ -70,8 +61,7 @@ def dated(folder, days, name="a", footprint=None) -> PointStore:
     [
         ((17_000, 17_001, 18_000, 49_000), (17_000, 17_001, 18_000, 49_000)),
         ((3_000, None, 3_000, 17_000), (0, 0, 0, 17_000)),  # 1978 is no time
-        ((17_000, 17_255, 17_001, 17_256), (0, 0, 0, 0)),  # of one code each
-        ((17_000, 17_255, 17_001, 17_001), (0, 0, 17_001, 17_001)),
+        ((17_000, 17_255, 17_001, 17_001), (0, 0, 17_001, 17_001)),  # of one code each
         ((None, None, None, None), (11_338,) * 4),  # the middle of the catalogue's days
     ],
 )
@@ -82,15 +72,15 @@ def test_each_point_has_its_day(tmp_path, days, told):
     assert (points.day == np.array(told)[points.classification - 1]).all()
     shared = any("cannot be told apart" in note for note in store.attrs["notes"])
     assert shared == (17_255 in days)
-    assert (query_points([store, store], *store.bounds[:4]).day[4000:] == points.day).all()
 
 
 def test_days_of_a_part_are_those_of_the_whole(tmp_path):
     """A cell has the same bytes whatever other days the file has elsewhere."""
-    whole = dated(tmp_path, (17_000, 17_001, 18_000, 49_000))
+    days = 17_000, 17_001, 18_000, 49_000
+    whole = dated(tmp_path, days)
     row, col = whole.cell_row[0], whole.cell_col[0]
     footprint = Footprint(int(row), int(col), np.ones((2, 2), np.bool_))
-    part = dated(tmp_path, (17_000, 17_001, 18_000, 49_000), "part", footprint)
+    part = dated(tmp_path, days, "part", footprint)
     assert 0 < part.count < whole.count
     assert content_of(part) == part_of(whole, footprint)
     assert (part.days == whole.days).all()
@@ -99,18 +89,19 @@ def test_days_of_a_part_are_those_of_the_whole(tmp_path):
 def test_days_without_end_are_none(tmp_path):
     """Times that are noise: first and last day are told, as of any file, and no day of a point."""
     times = np.random.default_rng(0).uniform(-9e8, 9e8, 3000)
-    store = with_times(tmp_path / "a.laz", times, absolute=True)
-    found = ingest(store, tmp_path / "s.points")
+    write_las(tmp_path / "a.laz", 3000, gps_time=times, absolute=True)
+    found = ingest(tmp_path / "a.laz", tmp_path / "s.points")
     assert found["acquired"]["start"] < "1985" and found["days"] == []
     assert (everything(PointStore(tmp_path / "s.points")).day == 0).all()
 
 
-def test_days_are_counted_from_1970():
-    assert number_of("1970-01-01") == 0 and number_of("2019-03-01") == 17_956
-
-
-@pytest.mark.parametrize("day", ["0001-01-01", "1900-01-01", "1970-01-01", "9999-12-31"])
+@pytest.mark.parametrize("day", ["0001-01-01", "1970-01-01", "9999-12-31"])
 def test_a_day_that_stands_for_none_is_none(day):
     """Catalogues write such ones where they know nothing."""
-    acquired = {"start": day, "end": day, "by": "catalogue"}
-    assert not days_by_code([], acquired).any()
+    assert number_of("2019-03-01") == 17_956
+    assert not days_by_code([], {"start": day, "end": day, "by": "catalogue"}).any()
+
+
+def test_runs_of_time_end_where_no_point_was_measured():
+    assert runs_of([3, 4, 5, 8, 9, 20]).tolist() == [3, 3, 3, 8, 8, 20]
+    assert runs_of([]).size == 0
