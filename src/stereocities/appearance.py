@@ -12,8 +12,17 @@ import numpy as np
 
 from stereotruth.core.kernels import inlined
 
-from .patches import PATCH_M, PATCHES_A_CELL
-from .surfaces import CELL_M, FIRST_PATCH, GROUND, ROOF, TREE, WATER, in_shadow
+from .surfaces import (
+    CELL_M,
+    FIRST_PATCH,
+    GROUND,
+    PATCH_M,
+    PATCHES_A_CELL,
+    ROOF,
+    TREE,
+    WATER,
+    in_shadow,
+)
 
 SKY = 0.34  # diffuse share of the light
 GROUND_MEAN = 0.2  # reflectance that the ground keeps whatever its contrast

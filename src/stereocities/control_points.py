@@ -14,9 +14,18 @@ from stereotruth.core.products.files import write_table
 from .camera import project_point
 from .cities import CITIES, CitySpec, SceneSpec
 from .layout import scene_coordinates
-from .patches import NOTHING, PATCH_M, PATCHES_A_CELL
 from .render import Camera, ImagedScene, prepare
-from .surfaces import ANY_VIEW, IN_IMAGES, IN_LIDAR, Surfaces, cast, terrain_heights
+from .surfaces import (
+    ANY_VIEW,
+    IN_IMAGES,
+    IN_LIDAR,
+    NOTHING,
+    PATCH_M,
+    PATCHES_A_CELL,
+    Surfaces,
+    cast,
+    terrain_heights,
+)
 from .truth import seen_from
 
 log = logging.getLogger("stereotruth")

@@ -25,12 +25,11 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.kernels import inlined, kernel
 from stereotruth.core.products.files import atomic_file
 
-from .built_city import surfaces_of
+from .camera import LocalFrame
 from .cities import CitySpec, FlightStrip, SceneSpec, lidar_files, tile_index
-from .dated_worlds import world_of
-from .geodesy import LocalFrame
 from .layout import coverage, covered, frame_of
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, above_ground, terrain_at
+from .world import surfaces_of, world_of
 
 log = logging.getLogger("stereotruth")
 
@@ -293,7 +292,7 @@ def simulate_lidar_tile(
 
     ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together.
     ``seed`` draws noise, jitter and which pulses pass a crown. ``built``: the
-    city's surfaces in a file, see :func:`.built_city.surfaces_of`. Returns the number of points by
+    city's surfaces in a file, see :func:`.world.surfaces_of`. Returns the number of points by
     class.
     Raises InputError for a tile that the scene has not, or a spacing out of 0.1 to 5 m.
     """

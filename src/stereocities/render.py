@@ -18,11 +18,8 @@ from stereotruth.core.kernels import inlined, kernel
 from stereotruth.core.products.files import atomic_file
 
 from .appearance import reflectance
-from .built_city import surfaces_of
-from .camera import Pass, aim, direction, jittering, pose, rays
+from .camera import LocalFrame, Pass, aim, direction, jittering, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec, ViewSpec
-from .dated_worlds import world_of
-from .geodesy import LocalFrame
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc, read_rpc, rpc_camera
 from .surfaces import (
@@ -39,6 +36,7 @@ from .surfaces import (
     spline_cell,
     terrain_heights,
 )
+from .world import surfaces_of, world_of
 
 log = logging.getLogger("stereotruth")
 
@@ -103,7 +101,7 @@ class ImagedScene(NamedTuple):
 def prepare(city: CitySpec, scene: SceneSpec, built: str | Path | None = None) -> ImagedScene:
     """World and cameras of a scene; kept for further calls of the same process.
 
-    ``built``: the city's surfaces in a file, see :func:`.built_city.surfaces_of`.
+    ``built``: the city's surfaces in a file, see :func:`.world.surfaces_of`.
     """
     return _prepare(city, scene, None if built is None else Path(built))
 

@@ -30,9 +30,9 @@ from .camera import (
     STATION_X,
     STATION_Y,
     STATION_Z,
+    LocalFrame,
     locate,
 )
-from .geodesy import LocalFrame
 
 
 @dataclass(frozen=True)

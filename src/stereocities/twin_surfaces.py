@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 
 from stereotruth.core.kernels import inlined, kernel
 
-from .patches import NOTHING, PATCH_M
-from .twin_points import Points
+from .surfaces import NOTHING, PATCH_M
 
+CLASSED_SHARE = 0.01  # of the points: less of a class, and its class was not looked for
 NEIGHBOURS = 10  # by which the plane of a point is told
 THIN_M = 0.4  # one point at most in a square of this side
 SEED_ROUGH_M = (
@@ -41,6 +41,26 @@ BUILDING_M2 = 400.0  # of one among others that it touches
 SEAM_M = 0.35  # planes that come so near each other meet in a ridge or a valley
 SEAM = 3  # patches to each side, among which such a plane is sought
 SIDE_M = 1.0  # over which the directions of sides are smoothed
+
+
+class Points(NamedTuple):
+    """Points of a place: ``xyz`` float64[n, 3] in the world frame; ``label`` uint8[n]: class of
+    LAS; ``single``, ``first`` bool[n]: the only, the first return of its pulse; ``tint``
+    float32[n]: reflectance, None where the file tells none."""
+
+    xyz: np.ndarray
+    label: np.ndarray
+    single: np.ndarray
+    first: np.ndarray
+    tint: np.ndarray | None
+
+    def which(self, use: np.ndarray) -> Points:
+        """The points of a mask or of indices."""
+        return Points(*(None if values is None else values[use] for values in self))
+
+    def has_class(self, *labels: int) -> bool:
+        """Whether the file tells which points are of these classes."""
+        return bool(np.isin(self.label, labels).mean() > CLASSED_SHARE)
 
 
 class Planes(NamedTuple):

@@ -11,8 +11,8 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereocities.__main__ import make_scene
 from stereocities.cities import SceneSpec
+from stereocities.sites import make_scene
 from stereotruth.project.example_city import DEMO
 
 from .forked_snakemake import planner, runner, start_snakemake

@@ -1,7 +1,7 @@
 """A stereo method over images of any size: overlapping tiles, put together without seams.
 
 For methods over images that lie in memory, or in Dask arrays; the package goes over scenes on the
-disk (:mod:`stereobench.methods.scenes.predict_scene`), by the same tiles.
+disk (:mod:`stereobench.methods.predict_scene`), by the same tiles.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereobench.methods.matcher import Matcher
-from stereobench.methods.scenes.tiling import (
+from stereobench.methods.tiling import (
     BLOCK_PX,
     OVERLAP_PX,
     Disparities,
@@ -42,12 +42,12 @@ def match(
     Of NumPy arrays the disparity itself, float32[h, w] px (NaN: invalid); of Dask arrays a lazy
     array in chunks of ``block``, whose memory is that of some tiles. ``offset``: of the right
     image, px; one for all, one for each block [n, m], or "auto": found from the images, see
-    :mod:`stereobench.methods.scenes.offsets`.
+    :mod:`stereobench.methods.tiling`.
     """
     import dask
     import dask.array as da
 
-    from stereobench.methods.scenes.offsets import find_offsets
+    from stereobench.methods.tiling import find_offsets
 
     lazy = isinstance(left, da.Array)
     tiling = Tiling(tuple(left.shape[:2]), block, overlap)

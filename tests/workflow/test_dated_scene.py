@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import zarr
 
-from stereocities.__main__ import make_scene
-from stereocities.changes import REASONS, changes_at
 from stereocities.cities import Dates
+from stereocities.sites import make_scene
 from stereocities.surfaces import WATER
+from stereocities.truth import REASONS, changes_at
 from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluate.epipolar_truth import truth_window

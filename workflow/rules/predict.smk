@@ -24,7 +24,7 @@ rule predict_scene:
         method=lambda w: method_entry(w.method, prediction_dataset()),
         settings=lambda w: scene_prediction(),
         code=lambda w: source_digest(
-            "stereobench.methods.scenes.predict_scene", *method_modules(w.method)
+            "stereobench.methods.predict_scene", *method_modules(w.method)
         ),
     message:
         "Disparities of scene {wildcards.scene} by {wildcards.method}"
@@ -54,7 +54,7 @@ rule dsm:
         sources=upstream("dsm"),
         script=content_of("../scripts/dsm.py"),
         settings=SETTINGS.predict.dsm.model_dump(),
-        code=source_digest("stereobench.methods.scenes.surface_model"),
+        code=source_digest("stereobench.methods.surface_model"),
     message:
         "Surface model of scene {wildcards.scene} by {wildcards.method}"
     script:

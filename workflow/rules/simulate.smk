@@ -17,7 +17,7 @@ rule simulate_city:
     params:
         sources=upstream("simulate_city"),
         script=content_of("../scripts/simulate_city.py"),
-        code=source_digest("stereocities.built_city", "stereocities.cities"),
+        code=source_digest("stereocities.world", "stereocities.cities"),
     message:
         "Building synthetic city {wildcards.city}"
     script:

@@ -31,9 +31,16 @@ from torch import Tensor, nn
 from stereotruth.core.errors import InputError
 
 from ..methods.matcher import spread
-from .keras_weights import read_keras
 from .layers import channels_last, perplexity, resize
-from .weights import SavedNetwork, Scaling, covering, image_statistics, load_weights, scaled
+from .weights import (
+    SavedNetwork,
+    Scaling,
+    covering,
+    image_statistics,
+    load_weights,
+    read_keras,
+    scaled,
+)
 
 log = logging.getLogger("stereotruth")
 
@@ -219,7 +226,7 @@ def load_network(
 ) -> tuple[SavedNetwork, nn.Module]:
     """The network of a file, which tells its kind itself; one of Keras is taken for ``kind``.
 
-    ``scaling``: of the images for a file of Keras, see :func:`keras_weights.read_keras`.
+    ``scaling``: of the images for a file of Keras, see :func:`.weights.read_keras`.
     Raises InputError if there is no such file, or it does not hold the network's weights.
     """
     if Path(path).suffix in (".h5", ".hdf5"):

@@ -1,4 +1,4 @@
-"""The state of a training between steps, and what a training leaves.
+"""How a network is trained, the state of a training between steps, and what a training leaves.
 
 State: start, file, what is frozen, learning rate. Left are weights, curves, a figure, a summary.
 """
@@ -18,6 +18,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from stereotruth.core.config.methods import Training
+from stereotruth.core.config.section import Whole
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import atomic_file, write_table
 from stereotruth.core.products.inputs import Marks, marks, refuse_replaced
@@ -27,8 +29,33 @@ from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from .inference import load_network
 from .training_pairs import LabelledPairs
-from .training_settings import TrainingSettings
 from .weights import SavedNetwork, covering, load_weights, save_weights, scaling_of
+
+
+class TrainingSettings(Training):
+    """How a network is trained, with what does not stand in the section training."""
+
+    threads: Whole = 0
+    seed: Whole = 0
+
+    def on(self, threads: int) -> TrainingSettings:
+        """The same, with so many threads on a CPU where the configuration leaves that open."""
+        return self.model_copy(update={"threads": self.threads or threads})
+
+    def content(self) -> dict[str, Any]:
+        """What the weights follow from: all but how long and where the work is done."""
+        left_out = ("epochs", "hours", "threads", "loader_workers", "checkpoint_minutes", "device")
+        return self.model_dump(exclude=set(left_out))
+
+
+def check_crop(network: nn.Module, crop: tuple[int, int] | None) -> None:
+    """InputError unless the sides of ``crop`` fit the network."""
+    if crop and any(side % network.divisor for side in crop):
+        raise InputError(
+            f"training.crop_px {list(crop)}: no multiples of {network.divisor} px",
+            remedy=f"{type(network).__name__} needs them",
+        )
+
 
 log = logging.getLogger("stereotruth")
 

@@ -11,8 +11,7 @@ from stereocities.cities import Character, CitySpec, SceneSpec, lidar_files
 from stereocities.control_points import simulate_points
 from stereocities.lidar import simulate_lidar_tile
 from stereocities.render import simulate_image
-from stereocities.site_images import simulate_site_image, simulate_site_points
-from stereocities.sites import SiteSpec, images_drawn
+from stereocities.sites import SiteSpec, images_drawn, simulate_site_image, simulate_site_points
 
 from ..core.sheets import Image
 

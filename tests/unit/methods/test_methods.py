@@ -17,7 +17,7 @@ from stereobench.methods.kinds import KINDS, names_of
 from stereobench.methods.matcher import Matcher
 from stereobench.methods.methods import make_method
 from stereobench.methods.sgm import SemiGlobalMatcher
-from stereobench.methods.user_function import FunctionMethod
+from stereobench.methods.user_methods import FunctionMethod
 from stereotruth.core.errors import InputError
 
 MODULE = """

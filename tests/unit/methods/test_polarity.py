@@ -7,10 +7,9 @@ import pytest
 from scipy.ndimage import convolve1d, gaussian_filter
 
 from stereobench.methods.matcher import Matcher
-from stereobench.methods.methods import make_method
-from stereobench.methods.polarity import PositiveMethod, with_polarity
+from stereobench.methods.methods import PositiveMethod, make_method, with_polarity
 from stereobench.methods.sgm import SemiGlobalMatcher, grey_mapping, to_8_bits
-from stereobench.methods.user_function import FunctionMethod
+from stereobench.methods.user_methods import FunctionMethod
 from stereotruth.core.errors import InputError
 
 RANGE = (-128, 64)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereobench.methods.result_files import read_result
+from stereobench.methods.user_methods import read_result
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.rasters import image_shape, read_disparity, read_image
 

@@ -134,7 +134,7 @@ def test_many_pairs_are_one_call_in_their_order(here, monkeypatch):
     assert [float(of.disparity[0, 0]) for of in found] == [5, 3, 4]
     assert found[0].disparity.dtype == np.float32
     assert Path("calls.txt").read_text().split() == [f"p{n}_left.tif" for n in (5, 3, 4)]
-    monkeypatch.setattr("stereobench.methods.user_command.MOST_PAIRS", 2)
+    monkeypatch.setattr("stereobench.methods.user_methods.MOST_PAIRS", 2)
     found = list(toy().many([constant(n) for n in (5, 3, 4)], RANGE))
     assert [float(of.disparity[0, 0]) for of in found] == [5, 3, 4]
 

@@ -10,7 +10,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereobench.methods.kinds import NETWORKS
-from stereobench.networks import inference, keras_weights, weights
+from stereobench.networks import inference, weights
 from stereobench.networks.inference import NetworkMethod
 from stereobench.networks.weights import SavedNetwork
 from stereotruth.core.errors import InputError
@@ -134,7 +134,7 @@ def test_published_stereonet_gives_the_reference_outputs(
 ) -> None:
     """All four outputs of the authors' code under TensorFlow, within 1e-3 px."""
     network = SavedNetwork("stereonet", span, channels).build()
-    keras_weights.load_keras(network, PUBLISHED / f"weights/StereoNet_{name}.h5")
+    weights.load_keras(network, PUBLISHED / f"weights/StereoNet_{name}.h5")
     reference = np.load(PUBLISHED / f"reference/stereonet_{name}_synth256.npz")
     images = [
         torch.from_numpy(reference[k].transpose(2, 0, 1)[None].copy()) for k in ("left", "right")

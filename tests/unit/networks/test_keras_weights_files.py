@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: make test-networks")
-from stereobench.networks.keras_weights import read_weights
+from stereobench.networks.weights import read_weights
 from stereotruth.core.errors import InputError
 
 KERNEL = np.arange(6, dtype=np.float32).reshape(2, 3)

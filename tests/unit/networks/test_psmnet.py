@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereobench.networks import layers
-from stereobench.networks.psmnet import PSMNet
+from stereobench.networks.cost_volume_networks import PSMNet
 
 
 def test_disparities_of_psmnet_are_those_of_costs_spread_to_full_size() -> None:

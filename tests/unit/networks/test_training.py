@@ -17,8 +17,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereobench.networks import training_state
 from stereobench.networks.training import train
-from stereobench.networks.training_settings import TrainingSettings
-from stereobench.networks.training_state import start
+from stereobench.networks.training_state import TrainingSettings, start
 from stereobench.networks.weights import SavedNetwork, load_weights, save_weights
 from stereotruth.core.errors import InputError
 from stereotruth.tiles.stereo_dataset import StereoDataset
@@ -26,7 +25,6 @@ from stereotruth.tiles.stereo_dataset import StereoDataset
 from ...synthetic.pictures import read_picture, share_of
 from ...synthetic.small_pairs import RANGE
 
-pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 MODEL = SavedNetwork("stereonet", RANGE)
 SHORT = TrainingSettings(epochs=2, crop_px=(32, 64), device="cpu", threads=1, seed=4)
 
@@ -70,7 +68,7 @@ import sys
 from pathlib import Path
 from stereotruth.tiles.stereo_dataset import StereoDataset
 from stereobench.networks.training import train
-from stereobench.networks.training_settings import TrainingSettings
+from stereobench.networks.training_state import TrainingSettings
 from stereobench.networks.weights import SavedNetwork
 if __name__ == "__main__":
     root, out = map(Path, sys.argv[1:])

@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereobench.networks import training_state
-from stereobench.networks.training_settings import TrainingSettings
+from stereobench.networks.training_state import TrainingSettings
 
 
 def test_the_learning_rate_is_halved_every_ten_epochs() -> None:

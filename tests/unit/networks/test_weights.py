@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
-from stereobench.networks import inference, keras_weights, weights
+from stereobench.networks import inference, weights
 from stereobench.networks.weights import SavedNetwork
 from stereotruth.core.errors import InputError
 
@@ -50,11 +50,11 @@ def test_weight_files_hold_all_that_is_needed(tmp_path: Path) -> None:
 def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     write_as_keras(method().network, tmp_path / "net.h5")
     with pytest.raises(InputError, match=r"layer 0: .* differs is number 0"):
-        keras_weights.load_keras(
+        weights.load_keras(
             SavedNetwork("stereonet", (-64, 64), channels=3).build(), tmp_path / "net.h5"
         )
     with pytest.raises(InputError, match="5 layers with weights, PSMNet has"):
-        keras_weights.load_keras(SavedNetwork("psmnet", (-64, 64)).build(), tmp_path / "net.h5")
+        weights.load_keras(SavedNetwork("psmnet", (-64, 64)).build(), tmp_path / "net.h5")
     (tmp_path / "text.h5").write_text("no weights")
     with pytest.raises(InputError, match="not a weight file of Keras"):
-        keras_weights.read_weights(tmp_path / "text.h5")
+        weights.read_weights(tmp_path / "text.h5")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
-from stereobench.methods.polarity import with_polarity
+from stereobench.methods.methods import with_polarity
 from stereobench.networks import weights
 
 from ...synthetic.small_networks import method

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from stereocities.site_images import simulate_site_image
+from stereocities.sites import simulate_site_image
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.project.check import check_project

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereocities.built_city import top_surface
 from stereocities.layout import frame_of
 from stereocities.surfaces import terrain_heights
-from stereocities.world import build_surfaces
+from stereocities.world import build_surfaces, top_surface
 
 from ...synthetic.small_cities import GROUND, ONE_BOX, ROOF
 

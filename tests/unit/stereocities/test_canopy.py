@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from stereocities.camera import rays
-from stereocities.canopy import BOUGHS
 from stereocities.cities import CitySpec, lidar_files
 from stereocities.lidar import INSIDE, simulate_lidar_tile
+from stereocities.objects import BOUGHS
 from stereocities.render import prepare
 from stereocities.surfaces import IN_IMAGES, IN_LEFT, IN_LIDAR, IN_RIGHT, terrain_heights
 from stereocities.world import build_surfaces

@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereocities.built_city import surfaces_of
-from stereocities.changes import REASONS, changes_at
 from stereocities.cities import CitySpec, Dates
-from stereocities.dated_worlds import world_of
 from stereocities.render import prepare
 from stereocities.surfaces import IN_IMAGES, IN_LEFT, IN_LIDAR, IN_RIGHT, terrain_heights
-from stereocities.truth import truth_at
+from stereocities.truth import REASONS, changes_at, truth_at
+from stereocities.world import surfaces_of, world_of
 
 from ...synthetic.small_cities import TOWN, TREE
 

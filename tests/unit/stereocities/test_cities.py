@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from stereocities import layout
-from stereocities.built_city import surfaces_of
 from stereocities.cities import CITIES, CitySpec, lidar_files
 from stereocities.control_points import make_points
 from stereocities.surfaces import IN_IMAGES, IN_LIDAR
+from stereocities.world import surfaces_of
 
 from ...synthetic.small_cities import ROOT, read_points
 

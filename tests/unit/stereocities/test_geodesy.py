@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyproj
 
-from stereocities.geodesy import LocalFrame
+from stereocities.camera import LocalFrame
 
 
 def test_local_frame_agrees_with_pyproj() -> None:

@@ -7,9 +7,8 @@ import pytest
 from rasterio.rpc import RPC
 from rasterio.transform import RPCTransformer
 
-from stereocities.camera import jittering, locate, project
+from stereocities.camera import LocalFrame, jittering, locate, project
 from stereocities.cities import Jitter
-from stereocities.geodesy import LocalFrame
 from stereocities.layout import frame_of
 from stereocities.render import prepare
 from stereocities.rpcs import NAMES, RATIOS, read_rpc, rpc_camera

@@ -7,8 +7,15 @@ import pytest
 
 from stereocities.camera import project, rays
 from stereocities.layout import frame_of
-from stereocities.site_images import camera_of, image_truth, pair_truth, site_points
-from stereocities.sites import LOWEST_SUN_DEG, drawn_site, sun_at
+from stereocities.sites import (
+    LOWEST_SUN_DEG,
+    camera_of,
+    drawn_site,
+    image_truth,
+    pair_truth,
+    site_points,
+    sun_at,
+)
 from stereotruth.project.example_city import SITE
 
 

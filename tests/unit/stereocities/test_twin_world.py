@@ -10,26 +10,25 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereocities.built_city import surfaces_of, top_surface
 from stereocities.camera import rays
-from stereocities.changes import BUILT, DEMOLISHED, changes_at
 from stereocities.cities import Dates, FlightStrip, Jitter, ViewSpec, read_city, write_city
-from stereocities.dated_worlds import YOUNG
 from stereocities.lidar import simulate_lidar_tile
-from stereocities.patches import PATCH_M, PATCHES_A_CELL
 from stereocities.render import prepare
 from stereocities.surfaces import (
     CELL_M,
     GROUND,
     IN_IMAGES,
     IN_LIDAR,
+    PATCH_M,
+    PATCHES_A_CELL,
     ROOF,
     TREE,
     WALL,
     terrain_heights,
 )
-from stereocities.truth import truth_at
+from stereocities.truth import BUILT, DEMOLISHED, changes_at, truth_at
 from stereocities.twin_world import twin_city
+from stereocities.world import YOUNG, surfaces_of, top_surface
 from stereotruth.core.errors import InputError
 
 from ...synthetic import house_points as place

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereobench.methods.scenes.tiling import Tiling, blend
+from stereobench.methods.tiling import Tiling, blend
 
-from ....synthetic.exact_method import SHAPE, Exact, coded
-from ....synthetic.whole_images import match
+from ...synthetic.exact_method import SHAPE, Exact, coded
+from ...synthetic.whole_images import match
 
 
 def test_tiles_that_differ_a_little_leave_no_step():

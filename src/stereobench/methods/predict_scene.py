@@ -1,7 +1,7 @@
 """A stereo method over the rectified images of a whole scene, in blocks that outlive their job.
 
 Work goes in two rounds over the grid, both kept as :mod:`stereotruth.core.products.resumable_grids`
-keeps blocks: the method makes the tiles (:mod:`stereobench.methods.scenes.tiling`), side by
+keeps blocks: the method makes the tiles (:mod:`stereobench.methods.tiling`), side by
 side in a grid of their own, one to a file; then the blocks are blended from the tiles that reach
 into them. Memory is that of the tiles at work. A job that was killed goes on with the tiles that
 lack; the result has the same bytes for any number of workers and kills, as far as the method itself
@@ -30,11 +30,10 @@ from stereotruth.core.products.grids import Layer, require_complete
 from stereotruth.core.products.provenance import describe, digest, file_sha256
 from stereotruth.core.products.resumable_grids import BlockStore, resumable_grid
 
-from ..kinds import kind_of, names_of
-from ..matcher import Matcher
-from ..methods import make_method
-from .offsets import Offsets, find_offsets
-from .tiling import Tiling, blend, inside, predict_tile, view_of
+from .kinds import kind_of, names_of
+from .matcher import Matcher
+from .methods import make_method
+from .tiling import Offsets, Tiling, blend, find_offsets, inside, predict_tile, view_of
 
 log = logging.getLogger("stereotruth")
 DisparityRange = tuple[int, int]

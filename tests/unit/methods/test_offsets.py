@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereobench.methods.scenes.offsets import best_offset, find_offsets, reduced
-from stereobench.methods.scenes.tiling import Tiling
 from stereobench.methods.sgm import SemiGlobalMatcher
+from stereobench.methods.tiling import Tiling, best_offset, find_offsets, reduced
 from stereotruth.core.errors import InputError
 
-from ....synthetic.exact_method import SHAPE, Exact, coded
-from ....synthetic.images import textured
-from ....synthetic.whole_images import match
+from ...synthetic.exact_method import SHAPE, Exact, coded
+from ...synthetic.images import textured
+from ...synthetic.whole_images import match
 
 
 def test_offsets_of_blocks_bring_a_large_relief_into_a_small_range():

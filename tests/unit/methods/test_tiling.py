@@ -6,12 +6,12 @@ import dask.array as da
 import numpy as np
 import pytest
 
-from stereobench.methods.scenes.tiling import Tiling, view_of
 from stereobench.methods.sgm import SemiGlobalMatcher
+from stereobench.methods.tiling import Tiling, view_of
 
-from ....synthetic.exact_method import SHAPE, Exact, coded, plane_with_step
-from ....synthetic.images import textured
-from ....synthetic.whole_images import match
+from ...synthetic.exact_method import SHAPE, Exact, coded, plane_with_step
+from ...synthetic.images import textured
+from ...synthetic.whole_images import match
 
 
 @pytest.mark.parametrize(("block", "overlap"), [(64, 16), (64, 0), (32, 16), (512, 64)])

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import zarr
 
+from stereobench.methods import predict_scene as whole
 from stereobench.methods.methods import make_method
-from stereobench.methods.scenes import predict_scene as whole
-from stereobench.methods.scenes.predict_scene import predict_scene
+from stereobench.methods.predict_scene import predict_scene
 from stereotruth.core.config.methods import SceneMatching
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import dask_scheduler
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid, open_grid
 
-from ....synthetic.images import textured
-from ....synthetic.stores import Killed, tree
-from ....synthetic.whole_images import match
+from ...synthetic.images import textured
+from ...synthetic.stores import Killed, tree
+from ...synthetic.whole_images import match
 
 SHAPE = (300, 600)  # 2 by 3 tiles
 SETTINGS = {"kind": "sgm", "mode": "sgbm"}

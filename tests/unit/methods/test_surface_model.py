@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereobench.methods.scenes import surface_model
-from stereobench.methods.scenes.surface_model import (
+from stereobench.methods import surface_model
+from stereobench.methods.surface_model import (
     Raster,
     default_resolution,
     gsd,
@@ -23,10 +23,10 @@ from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.intersection import intersect
 from stereotruth.epipolar.model import EpipolarModel
 
-from ....synthetic.cameras import HEIGHT
-from ....synthetic.flat_model import EPSG, SIZE, disparity_of, make_model, metres, plane
-from ....synthetic.other_programs import PROGRAMS
-from ....synthetic.stores import Killed
+from ...synthetic.cameras import HEIGHT
+from ...synthetic.flat_model import EPSG, SIZE, disparity_of, make_model, metres, plane
+from ...synthetic.other_programs import PROGRAMS
+from ...synthetic.stores import Killed
 
 
 @pytest.fixture(scope="module")
