@@ -18,6 +18,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import dask.array as da
 import dask.threaded
 import numpy as np
 import zarr
@@ -33,7 +34,7 @@ from stereotruth.core.products.resumable_grids import BlockStore, resumable_grid
 from .kinds import kind_of, names_of
 from .matcher import Matcher
 from .methods import make_method
-from .tiling import Offsets, Tiling, blend, find_offsets, inside, predict_tile, view_of
+from .tiling import Offsets, Tiling, blend, find_offsets, predict_tile
 
 log = logging.getLogger("stereotruth")
 DisparityRange = tuple[int, int]
@@ -98,21 +99,15 @@ class _ImagePair:
 
     def tile(self, out: BlockStore, key: str, place: Place, offset: int) -> None:
         """Predict one tile and write it to its place in the grid of tiles."""
-        window = self.tiling.tile_window(place)
-        matcher, shape = self.matcher, self.tiling.shape
-        margin = matcher.margin_px if self.margin is None else self.margin
-        view = view_of(shape, window, margin, self.disparity_range, offset)
-        left, right = self.images
         found = predict_tile(
-            matcher,
-            inside(left, view.left),
-            inside(right, view.right),
-            view,
+            self.matcher,
+            self.images,
             self.tiling,
             place,
             self.disparity_range,
             offset,
-            self.scaling,
+            margin_px=self.margin,
+            scaling=self.scaling,
         )
         arrays = {"disparity": found} if np.isfinite(found).any() else {}
         out.write(self._stored(place), key, arrays, None)
@@ -132,11 +127,6 @@ class _ImagePair:
     def _stored(self, place: Place) -> Window:
         side = self.tiling.side
         return tuple(slice(k * side, (k + 1) * side) for k in place)
-
-
-def _fixed(offset: Any, tiling: Tiling) -> Offsets:
-    offsets = np.full(tiling.count, int(offset), dtype=np.int64)
-    return Offsets(offsets, np.ones(tiling.count, np.bool_), 1.0, np.ones(tiling.count))
 
 
 def _search(attrs: Mapping[str, Any]) -> DisparityRange | None:
@@ -210,7 +200,8 @@ def predict_scene(
         margin=settings.margin_px,
     )
     moved = _offsets(start, settings, left_attrs)
-    job = replace(start, scaling=start.matcher.scaling(*_lazy(*start.images)))
+    scaling = start.matcher.scaling(*map(da.from_zarr, start.images))
+    job = replace(start, scaling=scaling)
     parameters = _parameters(job, settings)
     files = [file for file in kind.files(entry) if file.is_file()]
     content = digest(
@@ -223,10 +214,13 @@ def predict_scene(
             "code": code,
         }
     )
-    plan = _Plan.of(job.tiling, content, moved)
+    windows = [job.tiling.block_window(place) for place in job.tiling.places()]
     with resumable_grid(out, shape, LAYERS, chunk=CHUNK, shard=settings.block_px) as unfinished:
-        tiles = _make_blocks(job, plan, unfinished, out, (scheduler, workers))
-        summary = _summary(unfinished.results(plan.windows), shape, moved)
+        tiles = out.with_name(f"{out.name}.tiles")
+        folder = _make_blocks(
+            job, content, moved.offsets, (unfinished, tiles), (scheduler, workers)
+        )
+        summary = _summary(unfinished.results(windows), shape, moved)
         inputs = {
             name: digest(dict(attrs.get("provenance", {})))
             for name, attrs in (("left", left_attrs), ("right", right_attrs))
@@ -242,8 +236,8 @@ def predict_scene(
             "summary": summary,
             "provenance": describe(inputs, parameters, code),
         }
-        unfinished.write_atomically(out, plan.windows, attrs)
-        shutil.rmtree(tiles.folder, ignore_errors=True)
+        unfinished.write_atomically(out, windows, attrs)
+        shutil.rmtree(folder, ignore_errors=True)
     log.info(
         "%s: %.1f %% of the grid has a disparity, %.0f to %.0f px",
         method,
@@ -254,36 +248,11 @@ def predict_scene(
     return summary
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Blocks of a scene and the tiles that they are blended from, with the keys of both.
-
-    ``offsets``: of the right image, px, by place; ``keys`` and ``windows`` go with ``places``.
-    """
-
-    tiling: Tiling
-    offsets: NDArray[np.int64]
-    places: list[Place]
-    windows: list[Window]
-    keys: list[str]
-    tile_keys: dict[Place, str]
-
-    @classmethod
-    def of(cls, tiling: Tiling, content: str, moved: Offsets) -> _Plan:
-        """By a digest of all that the disparities follow from but the offsets."""
-        places = list(tiling.places())
-        tile_keys = {
-            p: digest({"content": content, "offset": int(moved.offsets[p])}) for p in places
-        }
-        keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
-        windows = [tiling.block_window(place) for place in places]
-        return cls(tiling, moved.offsets, places, windows, keys, tile_keys)
-
-
 def _offsets(pair: _ImagePair, settings: SceneMatching, attrs: Mapping[str, Any]) -> Offsets:
     """By how much the right image is moved for each block."""
     if settings.offset != "auto":
-        return _fixed(settings.offset, pair.tiling)
+        count = pair.tiling.count
+        return Offsets(np.full(count, settings.offset, np.int64), np.ones(count, np.bool_), 1.0)
     return find_offsets(*pair.images, pair.tiling, pair.disparity_range, _search(attrs))
 
 
@@ -301,44 +270,44 @@ def _parameters(job: _ImagePair, settings: SceneMatching) -> dict[str, Any]:
 
 
 def _make_blocks(
-    job: _ImagePair, plan: _Plan, blocks: BlockStore, out: Path, by: tuple[Any, int]
-) -> BlockStore:
-    """Make the blocks that are missing, and the tiles that these need; the store of the tiles.
+    job: _ImagePair,
+    content: str,
+    offsets: NDArray[np.int64],
+    to: tuple[BlockStore, Path],
+    by: tuple[Any, int],
+) -> Path:
+    """Make the blocks that are missing, and the tiles that these need; the folder of the tiles.
 
-    ``by``: Dask's scheduler and its workers, which make one tile at a time if the method itself has
-    several threads.
+    ``content``: digest of all that the disparities follow from but the ``offsets`` [n, m], px.
+    ``to``: the store of the blocks, and the path of that of the tiles. ``by``: Dask's scheduler and
+    its workers, which make one tile at a time if the method itself has several threads.
     """
-    scheduler, workers = by
-    tiling, places = plan.tiling, plan.places
+    (blocks, out), (scheduler, workers) = to, by
+    tiling, places = job.tiling, list(job.tiling.places())
+    tile_keys = {p: digest({"content": content, "offset": int(offsets[p])}) for p in places}
+    keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
+    missing = blocks.missing([tiling.block_window(place) for place in places], keys, workers)
     shape = tuple(n * tiling.side for n in tiling.count)
     sizes = {"chunk": tiling.side, "shard": tiling.side}
-    missing = blocks.missing(plan.windows, plan.keys, workers)
-    with resumable_grid(out.with_name(f"{out.name}.tiles"), shape, LAYERS, **sizes) as tiles:
+    with resumable_grid(out, shape, LAYERS, **sizes) as tiles:
         wanted = sorted({p for k in missing for p in tiling.around(places[k])})
-        wanted_keys = [plan.tile_keys[p] for p in wanted]
         stored = [job._stored(p) for p in wanted]
-        todo = [wanted[k] for k in tiles.missing(stored, wanted_keys, workers)]
+        todo = tiles.missing(stored, [tile_keys[p] for p in wanted], workers)
         _run(
             job.tile,
-            [(tiles, plan.tile_keys[p], p, int(plan.offsets[p])) for p in todo],
+            [(tiles, tile_keys[wanted[k]], wanted[k], int(offsets[wanted[k]])) for k in todo],
             f"tiles by {job.method}",
             scheduler,
             workers if job.threads == 1 else 1,
         )
         _run(
             job.block,
-            [(tiles, blocks, plan.keys[k], places[k]) for k in missing],
+            [(tiles, blocks, keys[k], places[k]) for k in missing],
             "blending",
             scheduler,
             workers,
         )
-    return tiles
-
-
-def _lazy(*images: zarr.Array) -> list[Any]:
-    import dask.array as da
-
-    return [da.from_zarr(image) for image in images]
+    return tiles.folder
 
 
 def _summary(results: Sequence[Sequence[Any]], shape: tuple[int, int], moved: Offsets) -> dict:

@@ -1,4 +1,4 @@
-"""How a scene is cut into overlapping blocks, what each sees, its offset, and how blocks are blended.
+"""How a scene is cut into overlapping blocks, what each of them sees, and how they are blended.
 
 The left grid is cut into square blocks. A *tile* is what the method says of a block and of
 ``overlap`` px around it; for that it sees the images with the margins that it needs: ``margin_px``
@@ -136,21 +136,6 @@ def view_of(
     )
 
 
-def inside(image: Any, window: Window) -> Any:
-    """The part of an image [h, w] or [h, w, bands] (NumPy, Dask, Zarr) that a window meets."""
-    rows, cols = window
-    return image[
-        max(rows.start, 0) : max(min(rows.stop, image.shape[0]), 0),
-        max(cols.start, 0) : max(min(cols.stop, image.shape[1]), 0),
-    ]
-
-
-def extent_of(weights: NDArray[np.float64]) -> slice | None:
-    """Where the weights are not 0."""
-    found = np.flatnonzero(weights > 0.0)
-    return slice(int(found[0]), int(found[-1]) + 1) if found.size else None
-
-
 Disparities = NDArray[np.float32]
 
 
@@ -159,15 +144,13 @@ LARGEST_BIAS_PX = 8.0  # between tiles; what differs by more on the whole is lef
 SAME_PX, OTHER_PX = 2.0, 4.0
 
 
-def _padded(part: Any, window: Window, shape: tuple[int, int]) -> NDArray[Any]:
-    """A part as :func:`.tiling.inside` gives it as the whole window, 0 beyond the image."""
-    part = np.asarray(part)
-    sizes = tuple(w.stop - w.start for w in window)
-    if part.shape[:2] == sizes:
-        return np.ascontiguousarray(part)
-    whole = np.zeros((*sizes, *part.shape[2:]), dtype=part.dtype)
-    at = tuple(slice(max(-w.start, 0), max(-w.start, 0) + n) for w, n in zip(window, part.shape))
-    whole[at] = part
+def _part(image: Any, window: Window) -> NDArray[Any]:
+    """A window of an image [h, w] or [h, w, bands] (NumPy, Dask, Zarr), 0 beyond it."""
+    part = np.asarray(image[tuple(slice(max(w.start, 0), max(w.stop, 0)) for w in window)])
+    whole = np.zeros((*(w.stop - w.start for w in window), *part.shape[2:]), part.dtype)
+    if part.size:
+        first = [max(-w.start, 0) for w in window]
+        whole[tuple(slice(k, k + n) for k, n in zip(first, part.shape))] = part
     return whole
 
 
@@ -178,21 +161,23 @@ def _shown(image: NDArray[Any]) -> NDArray[np.bool_]:
 
 def predict_tile(
     matcher: Matcher,
-    left: Any,
-    right: Any,
-    view: View,
+    images: tuple[Any, Any],
     tiling: Tiling,
     place: Place,
     disparity_range: DisparityRange,
     offset: int,
+    *,
+    margin_px: int | None = None,
     scaling: Any = None,
 ) -> Disparities:
     """The tile at a place, float32[side, side], NaN where invalid or beyond the grid.
 
-    ``left``, ``right``: the parts of the images that the ``view`` meets (:func:`.tiling.inside`).
+    ``images``: left and right one (NumPy, Dask, Zarr). ``margin_px``: None: that of the method.
     """
-    left = _padded(left, view.left, tiling.shape)
-    right = _padded(right, view.right, tiling.shape)
+    window = tiling.tile_window(place)
+    margin = matcher.margin_px if margin_px is None else margin_px
+    view = view_of(tiling.shape, window, margin, disparity_range, offset)
+    left, right = (_part(image, of) for image, of in zip(images, (view.left, view.right)))
     tile = np.full((tiling.side, tiling.side), np.nan, dtype=np.float32)
     shown = _shown(left)[view.inner]
     in_right = _shown(right)
@@ -205,7 +190,6 @@ def predict_tile(
         shown &= (there >= 0) & (there < right.shape[1])
     there = np.where(shown, there, 0).astype(np.intp)
     shown &= np.take_along_axis(in_right[view.inner[0]], there, axis=1)
-    window = tiling.tile_window(place)
     at = tuple(slice(max(-w.start, 0), max(-w.start, 0) + n) for w, n in zip(window, found.shape))
     tile[at] = np.where(shown, found + np.float32(offset), np.float32(np.nan))
     return tile
@@ -277,9 +261,10 @@ def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Dispariti
         for j, in_cols in _weights(tiling, 1, place[1]).items():
             if (i, j) == place:
                 continue
-            r, c = (extent_of(w) for w in (in_rows, in_cols))
-            if r is None or c is None:
+            reached = [np.flatnonzero(weights > 0.0) for weights in (in_rows, in_cols)]
+            if not all(map(len, reached)):
                 continue
+            r, c = (slice(int(at[0]), int(at[-1]) + 1) for at in reached)
             window = tuple(
                 slice(o.start + w.start, o.start + w.stop) for o, w in zip((rows, cols), (r, c))
             )
@@ -291,9 +276,6 @@ def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Dispariti
             weight = in_rows[r, None] * in_cols[None, c]
             change[r, c] += weight * (bias[at] + np.nan_to_num(same * rest))
     return (own + change).astype(np.float32)
-
-
-Ints = NDArray[np.int64]
 
 
 REDUCED_PX = 2048  # longest side of the reduced images
@@ -310,13 +292,11 @@ class Offsets:
 
     ``known``: blocks [n, m] whose own images told it; others have that of the nearest known one.
     ``in_range``: share of the known blocks' values that lie in the range of their block.
-    ``worst``: the smallest such share of a block, float64[n, m], NaN if not known.
     """
 
-    offsets: Ints
+    offsets: NDArray[np.int64]
     known: NDArray[np.bool_]
     in_range: float
-    worst: NDArray[np.float64]
 
 
 def reduced(image: Any, factor: int) -> NDArray[np.float32]:
@@ -417,7 +397,7 @@ def find_offsets(
             remedy="check that they are an epipolar pair of one scene, or give the offset",
         )
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    found = Offsets(offsets[tuple(nearest)], known, hits / count, shares)
+    found = Offsets(offsets[tuple(nearest)], known, hits / count)
     log.info(
         "offsets of the right image: %d to %d px in %d blocks; %.2f %% of the disparities of the "
         "scene, reduced %d times, lie in range",

@@ -271,9 +271,7 @@ def _steps(job: TrainingJob, epoch: int) -> list[list[int]]:
     return [order[k : k + size].tolist() for k in range(0, len(order) - size + 1, size)]
 
 
-def _batches(
-    job: TrainingJob, epoch: int, steps: Sequence[Sequence[int]], rank: int
-) -> DataLoader:
+def _batches(job: TrainingJob, epoch: int, steps: Sequence[Sequence[int]], rank: int) -> DataLoader:
     """This process' share of each step: left, right, disparity."""
     job.data.epoch = epoch
     mine = [list(step[rank :: job.processes]) for step in steps]
