@@ -440,6 +440,20 @@ def _ellipsoids(centre: np.ndarray, radius: np.ndarray, half: np.ndarray) -> np.
     return np.column_stack([centre, radius, half, (radius / half) ** 2])
 
 
+def _beside(
+    trees: np.ndarray,
+    away: np.ndarray,
+    turn: np.ndarray,
+    z: np.ndarray,
+    radius: np.ndarray,
+    half: np.ndarray,
+) -> np.ndarray:
+    """Ellipsoids that stand ``away`` from the axes of crowns [n, 6]; all values [n, k]."""
+    x, y = trees[:, :1] + away * np.cos(turn), trees[:, 1:2] + away * np.sin(turn)
+    centre = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    return _ellipsoids(centre, radius.ravel(), half.ravel())
+
+
 def _with_lobes(trees: np.ndarray, lobes: int, rng: np.random.Generator) -> np.ndarray:
     """The ellipsoids of crowns [n, 6], none wider than the crown; smooth without lobes."""
     if not lobes:
@@ -451,35 +465,21 @@ def _with_lobes(trees: np.ndarray, lobes: int, rng: np.random.Generator) -> np.n
     size = rng.uniform(*LOBE, (n, lobes))
     # so far out that a lobe ends where the crown's own ellipsoid does
     out, level = 1.0 - size, np.sqrt(1.0 - up * up)
-    centre = np.stack(
-        [
-            trees[:, :1] + trees[:, 3:4] * out * level * np.cos(turn),
-            trees[:, 1:2] + trees[:, 3:4] * out * level * np.sin(turn),
-            trees[:, 2:3] + trees[:, 4:5] * out * up,
-        ],
-        axis=-1,
-    )
-    radius, half = trees[:, 3:4] * size, trees[:, 4:5] * size
-    lobe = _ellipsoids(centre.reshape(-1, 3), radius.ravel(), half.ravel())
+    z = trees[:, 2:3] + trees[:, 4:5] * out * up
+    away = trees[:, 3:4] * out * level
+    lobe = _beside(trees, away, turn, z, trees[:, 3:4] * size, trees[:, 4:5] * size)
     return np.concatenate([core, lobe])
 
 
 def _boughs(trees: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The ellipsoids of crowns [n, 6] without leaves: upright boughs about the middle."""
-    n = len(trees)
-    turn = rng.uniform(0, 2 * math.pi, (n, BOUGHS))
-    away = rng.uniform(0.0, 0.5, (n, BOUGHS)) * trees[:, 3:4]
-    centre = np.stack(
-        [
-            trees[:, :1] + away * np.cos(turn),
-            trees[:, 1:2] + away * np.sin(turn),
-            np.repeat(trees[:, 2:3], BOUGHS, axis=1),
-        ],
-        axis=-1,
+    turn = rng.uniform(0, 2 * math.pi, (len(trees), BOUGHS))
+    away = rng.uniform(0.0, 0.5, (len(trees), BOUGHS)) * trees[:, 3:4]
+    z, radius, half = (
+        np.repeat(of, BOUGHS, axis=1)
+        for of in (trees[:, 2:3], BOUGH * trees[:, 3:4], 0.8 * trees[:, 4:5])
     )
-    radius = np.repeat(BOUGH * trees[:, 3:4], BOUGHS, axis=1)
-    half = np.repeat(0.8 * trees[:, 4:5], BOUGHS, axis=1)
-    return _ellipsoids(centre.reshape(-1, 3), radius.ravel(), half.ravel())
+    return _beside(trees, away, turn, z, radius, half)
 
 
 def place_trees(
@@ -533,14 +533,17 @@ def clear_of_walls(trees: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Which crowns [n, 6] stand in no wall, bool[n]."""
     free = np.ones(len(trees), bool)
     half = np.hypot(boxes[:, 4], boxes[:, 5])
-    for some in (half > 25, half <= 25):  # the few large ones reach far
-        b = boxes[some]
-        if not (len(b) and len(trees)):
+    order = np.argsort(-half)
+    for part in (order[half[order] > 25], order[half[order] <= 25]):  # few large ones reach far
+        if not (len(part) and len(trees)):
             continue
-        reach = float(half[some].max()) + 4.5
-        near = cKDTree(trees[:, :2]).query_ball_tree(cKDTree(b[:, :2]), reach)
+        # Known: where all boxes are of one part, those that are near are looked up in another
+        # order, and some crowns stand in walls. To mend it would move the data of such cities.
+        searched = boxes if len(part) == len(boxes) else boxes[part]
+        reach = float(half[part].max()) + 4.5
+        near = cKDTree(trees[:, :2]).query_ball_tree(cKDTree(searched[:, :2]), reach)
         which = np.repeat(np.arange(len(trees)), [len(of) for of in near])
-        b = b[np.array([box for of in near for box in of], int)]
+        b = boxes[part[np.array([box for of in near for box in of], int)]]
         dx, dy = trees[which, 0] - b[:, 0], trees[which, 1] - b[:, 1]
         u = np.abs(dx * b[:, 2] + dy * b[:, 3]) - b[:, 4]
         v = np.abs(dy * b[:, 2] - dx * b[:, 3]) - b[:, 5]

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import rasterio
-from rasterio.rpc import RPC as RPCMetadata
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import progress
@@ -77,6 +76,25 @@ class Camera(NamedTuple):
     radiometry: tuple[float, float]
     noise_seed: int
     look: ViewSpec = ViewSpec()
+
+    @property
+    def sight(self) -> Sight:
+        """What kernels need of it."""
+        return Sight(
+            self.surfaces, self.horizon, self.shown, self.cam, self.collar, self.cols, self.rows
+        )
+
+
+class Sight(NamedTuple):
+    """An image for kernels: its world, horizon (``above``), bits shown, camera, collar and size."""
+
+    surfaces: Surfaces
+    above: np.ndarray
+    shown: int
+    cam: np.ndarray
+    collar: int
+    cols: int
+    rows: int
 
 
 class Relief(NamedTuple):
@@ -250,12 +268,19 @@ def in_collar(collar, col, row, cols, rows):
     RIGHT_COLLAR: along the last rows and first columns.
     """
     if collar == LEFT_COLLAR:
-        return row < 3 + 14 * col / cols or col > cols - 4 - 9 * row / rows
-    return row > rows - 5 - 12 * col / cols or col < 3 + 10 * row / rows
+        return (row < 3 + 14 * col / cols) | (col > cols - 4 - 9 * row / rows)
+    return (row > rows - 5 - 12 * col / cols) | (col < 3 + 10 * row / rows)
 
 
 @inlined
-def _ray(cam, line, col):
+def has_data(image, col, row):
+    """Whether a position lies in the frame of an image, outside its collar."""
+    inside = col >= -0.5 and row >= -0.5 and col <= image.cols - 0.5 and row <= image.rows - 0.5
+    return inside and not in_collar(image.collar, col, row, image.cols, image.rows)
+
+
+@inlined
+def ray(cam, line, col):
     """(ax, ay, bx, by) of the ray of a column of a line."""
     dx, dy, dz = direction(cam, line, col)
     bx, by = dx / dz, dy / dz
@@ -278,7 +303,7 @@ def _ground_below(s, cam, lines, col, first, ground, before, work):
     """
     c = s.terrain
     for k in range(LANES):
-        ax, ay, bx, by = _ray(cam, lines[k], col)
+        ax, ay, bx, by = ray(cam, lines[k], col)
         z = ground[k]
         if not first:  # the ground goes on as it did
             z += ground[k] - before[k]
@@ -365,19 +390,6 @@ def _decimate(half: np.ndarray, psf_px: float) -> np.ndarray:
     return sum(w * across[start + k : start + k + 2 * size : 2] for k, w in enumerate(weights))
 
 
-def _rpc_metadata(rpc: FittedRPC) -> RPCMetadata:
-    line_off, samp_off, lat_off, lon_off, h_off, line_s, samp_s, lat_s, lon_s, h_s = map(
-        float, rpc.numbers
-    )
-    line_num, line_den, samp_num, samp_den = (c.tolist() for c in rpc.coefficients)
-    return RPCMetadata(
-        height_off=h_off, height_scale=h_s, lat_off=lat_off, lat_scale=lat_s,
-        line_den_coeff=line_den, line_num_coeff=line_num, line_off=line_off, line_scale=line_s,
-        long_off=lon_off, long_scale=lon_s, samp_den_coeff=samp_den, samp_num_coeff=samp_num,
-        samp_off=samp_off, samp_scale=samp_s, err_bias=12.0, err_rand=0.5,
-    )  # fmt: skip
-
-
 def simulate_image(
     city: CitySpec,
     scene: SceneSpec,
@@ -415,7 +427,7 @@ def render(camera: Camera, name: str, out_tif: str | Path, *, seed: int) -> dict
     profile = dict(
         driver="GTiff", width=cols, height=rows, count=1, dtype="uint16", nodata=0, tiled=True,
         blockxsize=256, blockysize=256, compress="deflate", predictor=2, zlevel=1,
-        rpcs=_rpc_metadata(camera.rpc),
+        rpcs=camera.rpc.metadata,
     )  # fmt: skip
     col_index = np.arange(cols, dtype=np.float64)[None, :]
     strips = range(0, rows, STRIP_ROWS)
@@ -434,17 +446,10 @@ def render(camera: Camera, name: str, out_tif: str | Path, *, seed: int) -> dict
             signal += noise * np.sqrt(4.0 + 0.035 * signal)
             values = np.clip(np.rint(signal * scale), 1, full_scale).astype(np.uint16)
             row = np.arange(first, first + count, dtype=np.float64)[:, None]
-            values[_collar(camera.collar, col_index, row, cols, rows)] = 0
+            values[in_collar(camera.collar, col_index, row, cols, rows)] = 0
             image[first : first + count] = values
         with rasterio.open(scratch, "w", **profile) as target:
             target.write(image, 1)
             bits = full_scale.bit_length()
             target.set_band_description(1, f"panchromatic, {bits} bits")
     return {"cols": cols, "rows": rows, "rpc_rms_px": camera.rpc.rms_px}
-
-
-def _collar(collar: int, col: np.ndarray, row: np.ndarray, cols: int, rows: int) -> np.ndarray:
-    """Vectorised :func:`in_collar`."""
-    if collar == LEFT_COLLAR:
-        return (row < 3 + 14 * col / cols) | (col > cols - 4 - 9 * row / rows)
-    return (row > rows - 5 - 12 * col / cols) | (col < 3 + 10 * row / rows)

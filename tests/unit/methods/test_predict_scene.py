@@ -147,16 +147,6 @@ def test_a_lost_block_needs_the_tiles_around_it(images, fresh, carried, tmp_path
     assert tree(out) == tree(fresh)
 
 
-@pytest.mark.parametrize(
-    "other", [{"code": "another"}, {"entry": {**SETTINGS, "uniqueness_percent": 10}}]
-)
-def test_other_code_or_settings_make_all_anew(images, carried, monkeypatch, other):
-    out = carried
-    made = tiles_made(monkeypatch)
-    predict(*images, out, **{**GIVEN, **other})
-    assert len(made) == 6
-
-
 def test_a_function_is_made_anew_when_its_file_changes(images, tmp_path, monkeypatch):
     module = tmp_path / "mine.py"
     text = "import numpy as np\n\ndef flat(left, right, r):\n    return np.full(left.shape, {})\n"
@@ -171,6 +161,8 @@ def test_a_function_is_made_anew_when_its_file_changes(images, tmp_path, monkeyp
     del made[:]
     summary = predict(*images, out, **given)
     assert len(made) == 6
+    predict(*images, out, **{**given, "code": "another"})
+    assert len(made) == 12
     assert (summary["disparity_min_px"], summary["disparity_max_px"]) == (7.0, 7.0)
 
 
