@@ -1,27 +1,25 @@
-"""Buildings, vehicles and trees of a drawn city.
+"""Buildings and trees of a drawn city.
 
-Buildings stand block by block of the land use; a few of them change between images and LiDAR. Each
-image and the LiDAR have the vehicles elsewhere. Crowns have rough tops, single, in rows and in
-forest, with leaves or without: a crown is the union of ellipsoids, a core and lobes that stand out
-of its upper half; without leaves it is a few boughs.
+Buildings stand block by block of the land use; a few of them change between images and LiDAR.
+Crowns have rough tops, single, in rows and in forest, with leaves or without: a crown is the union
+of ellipsoids, a core and lobes that stand out of its upper half; without leaves it is a few boughs.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .appearance import VEHICLE
 from .cities import Canopy, CitySpec
 from .layout import (
     BUILT,
     TEXTURE_SIZE,
     ZONE_KINDS,
     half_size,
-    image_axes,
     near_scenes,
     scene_coordinates,
     spectral_noise,
@@ -69,31 +67,19 @@ class _Builder:
     def __init__(self, city: CitySpec, s: Surfaces, sites: cKDTree, rng: np.random.Generator):
         self.city, self.s, self.sites, self.rng = city, s, sites, rng
         self.zone_cells = s.zone_cells.tolist()
-        self.around = [
-            (*scene.centre_m, *np.concatenate(image_axes(city, scene)), *half_size(scene))
-            for scene in city.scenes
-        ]
         self.boxes: list[tuple[float, ...]] = []
         self.style: list[tuple[float, ...]] = []
         self.group: list[int] = []
         self.groups = 0
         self.chance = np.random.default_rng([city.world_seed, 3])  # of what is not built
 
-    def _near(self, x: float, y: float) -> bool:
-        """:func:`.layout.near_scenes` of one position, without arrays: most buildings end here."""
-        margin = self.city.margin_m - 40
-        return any(
-            abs((x - cx) * ax + (y - cy) * ay) < width + margin
-            and abs((x - cx) * bx + (y - cy) * by) < height + margin
-            for cx, cy, ax, ay, bx, by, width, height in self.around
-        )
-
     def add(self, zone: int, house: House) -> bool:
         """Build a house of a zone (-1: of any) if it fits; whether it does."""
         cx, cy, wing, rise = house.cx, house.cy, house.wing, house.rise
         ux, uy = math.cos(house.angle), math.sin(house.angle)
         a, b = house.length / 2, house.width / 2
-        if not self._near(cx - a * ux + b * uy, cy - a * uy - b * ux):
+        corner = np.array([[cx - a * ux + b * uy, cy - a * uy - b * ux]])
+        if not near_scenes(self.city, corner, self.city.margin_m - 40)[0]:
             return False
         here = self.zone_cells[int((cy - self.s.y0) / CELL_M)][int((cx - self.s.x0) / CELL_M)]
         if zone >= 0 and here >= 0 and here != zone:
@@ -126,7 +112,7 @@ class _Builder:
         if cover is None:
             cover = TILES if rise > 1.2 else (FLAT, GRAVEL, FLAT, SHEET)[rng.integers(4)]
         for part in parts:
-            self._put(part, eaves, rise if wing is None else 0.0, roof, walls, cover)
+            self._put((*part, eaves, rise if wing is None else 0.0), (roof, walls, cover))
         broad = min(house.length, house.width) > 9.5
         if house.top and rise == 0 and broad and house.height > 9:
             for _ in range(int(rng.integers(1, 3 if house.length < 35 else 4))):
@@ -134,14 +120,26 @@ class _Builder:
                 du = rng.uniform(-1, 1) * (a - ta - 2.2)
                 dv = rng.uniform(-1, 1) * (b - tb - 1.8)
                 part = (cx + du * ux - dv * uy, cy + du * uy + dv * ux, ux, uy, ta, tb)
-                self._put(part, eaves + rng.uniform(2.0, 3.6), 0.0, roof * 0.9, walls, FLAT)
+                self._put((*part, eaves + rng.uniform(2.0, 3.6), 0.0), (roof * 0.9, walls, FLAT))
         self.groups += 1
         return True
 
-    def _put(self, part, eaves, rise, roof, walls, cover) -> None:
-        self.boxes.append((*part, eaves, rise))
-        self.style.append((roof, walls, cover, self.rng.uniform(0, 1000)))
+    def _put(self, box: tuple[float, ...], style: tuple[float, ...]) -> None:
+        self.boxes.append(box)
+        self.style.append((*style, self.rng.uniform(0, 1000)))
         self.group.append(self.groups)
+
+
+def _plots(
+    size: tuple[float, float], pitch: tuple[float, float], empty: float, rng: np.random.Generator
+) -> Iterator[tuple[float, float, float, float]]:
+    """Middles and sides of the plots of about a ``pitch`` of a block, but for a share of them."""
+    columns, lanes = (max(1, int(side // step)) for side, step in zip(size, pitch))
+    width, height = size[0] / columns, size[1] / lanes
+    for i in range(columns):
+        for j in range(lanes):
+            if rng.random() >= empty:
+                yield (i + 0.5) * width, (j + 0.5) * height, width, height
 
 
 def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) -> None:
@@ -176,35 +174,25 @@ def _fill_block(build: _Builder, zone: int, kind: str, at, size, angle, towers) 
                 build.add(zone, House(x, y, angle, length, width, 3.0 * storeys + 1))
                 p += length + rng.uniform(7, 12)
     elif kind == "lowrise":
-        columns, lanes = max(1, int(w // 21)), max(1, int(h // 18))
-        pitch_w, pitch_h = w / columns, h / lanes
-        for i in range(columns):
-            for j in range(lanes):
-                if rng.random() < 0.1:
-                    continue
-                length, width = rng.uniform(11, pitch_w - 2.5), rng.uniform(9, pitch_h - 3)
-                x, y = at((i + 0.5) * pitch_w, (j + 0.5) * pitch_h)
-                rise = rng.uniform(1.5, 3) if rng.random() < 0.25 else 0.0
-                turned = angle + rng.normal(0, 0.015)
-                height = 3.1 * int(rng.integers(2, 7))
-                build.add(zone, House(x, y, turned, length, width, height, rise))
+        for p, q, pitch_w, pitch_h in _plots(size, (21, 18), 0.1, rng):
+            length, width = rng.uniform(11, pitch_w - 2.5), rng.uniform(9, pitch_h - 3)
+            x, y = at(p, q)
+            rise = rng.uniform(1.5, 3) if rng.random() < 0.25 else 0.0
+            turned = angle + rng.normal(0, 0.015)
+            height = 3.1 * int(rng.integers(2, 7))
+            build.add(zone, House(x, y, turned, length, width, height, rise))
     elif kind == "village":
-        columns, lanes = max(1, int(w // 17)), max(1, int(h // 16))
-        pitch_w, pitch_h = w / columns, h / lanes
-        for i in range(columns):
-            for j in range(lanes):
-                if rng.random() < 0.28:
-                    continue
-                length, width = rng.uniform(9.5, 13), rng.uniform(7.5, 10)
-                x, y = at((i + 0.5) * pitch_w, (j + 0.5) * pitch_h)
-                gabled = rng.random() < 0.5
-                wing = None
-                if not gabled and rng.random() < 0.25:
-                    length, width, wing = 12.0, 6.5, (6.0, 5.0)
-                turned = angle + rng.normal(0, 0.05)
-                height = 3.0 * int(rng.integers(1, 4)) + 0.5
-                rise = rng.uniform(1.8, 3.0) if gabled else 0.0
-                build.add(zone, House(x, y, turned, length, width, height, rise, wing))
+        for p, q, _, _ in _plots(size, (17, 16), 0.28, rng):
+            length, width = rng.uniform(9.5, 13), rng.uniform(7.5, 10)
+            x, y = at(p, q)
+            gabled = rng.random() < 0.5
+            wing = None
+            if not gabled and rng.random() < 0.25:
+                length, width, wing = 12.0, 6.5, (6.0, 5.0)
+            turned = angle + rng.normal(0, 0.05)
+            height = 3.0 * int(rng.integers(1, 4)) + 0.5
+            rise = rng.uniform(1.8, 3.0) if gabled else 0.0
+            build.add(zone, House(x, y, turned, length, width, height, rise, wing))
     elif kind == "industry":
         lanes = 2 if rng.random() < 0.6 else 3
         for j in range(lanes):
@@ -288,67 +276,6 @@ def choose_changed(
         view[np.isin(group, chosen[:count])] = IN_IMAGES
         view[np.isin(group, chosen[count:])] = IN_LIDAR
     return view
-
-
-CAR_M = (4.4, 1.8, 1.5)  # length, width, height
-VAN_M = (7.5, 2.3, 2.8)
-VANS = 0.12  # share of the vehicles
-NARROWEST_M = 3.5  # half width of a street that vehicles use
-LANE = 0.35  # distance from the middle over half the width
-SLOW_M = (0.5, 6.0)  # way of a vehicle in slow traffic between the views
-APART_M = 15.0  # more than two bodies and the ways of both
-PARKED, SLOW, LEAVING, COMING = 0.25, 0.35, 0.15, 0.15  # shares; the others are in the LiDAR only
-
-
-def place_vehicles(city: CitySpec, s: Surfaces, sites: cKDTree) -> Objects:
-    """Vehicles of a city: parked ones, some that creep between the views, some in one of them."""
-    rng = np.random.default_rng([city.world_seed, 5])
-    ny, nx = s.cell_top.shape
-    size = np.array([nx, ny]) * CELL_M
-    count = round(city.character.vehicles * size.prod() / 1e4)
-    if not count:
-        return Objects(np.zeros((0, 8)), np.zeros(0, np.uint8), np.zeros((0, 4)))
-    xy = rng.uniform(0, 1, (count, 2)) * size + [s.x0, s.y0]
-    zone = s.zones[sites.query(xy)[1]]
-    cos, sin = zone[:, 2], zone[:, 3]
-    p, q = xy[:, 0] * cos + xy[:, 1] * sin, xy[:, 1] * cos - xy[:, 0] * sin
-    lane = rng.choice([-1.0, 1.0], count) * LANE * zone[:, 6]
-    along_q = rng.random(count) < 0.5
-    p = np.where(along_q, np.rint(p / zone[:, 4]) * zone[:, 4] + lane, p)
-    q = np.where(along_q, q, np.rint(q / zone[:, 5]) * zone[:, 5] + lane)
-    heading = np.column_stack([np.where(along_q, -sin, cos), np.where(along_q, cos, sin)])
-    xy = np.column_stack([p * cos - q * sin, p * sin + q * cos])
-    body = np.where((rng.random(count) < VANS)[:, None], VAN_M, CAR_M)
-    paint = rng.choice([0.06, 0.12, 0.25, 0.55, 0.75], count) * rng.uniform(0.9, 1.1, count)
-    way = rng.choice([-1.0, 1.0], count) * rng.uniform(*SLOW_M, count)
-    state = np.searchsorted(np.cumsum([PARKED, SLOW, LEAVING, COMING]), rng.random(count))
-    views = np.array([IN_IMAGES, IN_LEFT, IN_LEFT, IN_RIGHT, IN_LIDAR], np.uint8)[state]
-    if city.dates is not None and city.dates.left != city.dates.right:
-        # no vehicle waits from one image to the other
-        views = np.where(views == IN_IMAGES, IN_LEFT << (np.arange(count) % 2), views)
-    slow = np.flatnonzero(state == 1)
-    street = (zone[:, 7] < len(BUILT)) & (zone[:, 6] > NARROWEST_M)
-    street[cKDTree(xy).query_pairs(APART_M, output_type="ndarray").max(axis=1, initial=-1)] = False
-
-    order = np.concatenate([np.arange(count), slow])
-    at = np.concatenate([xy, xy[slow] + way[slow, None] * heading[slow]])
-    view = np.concatenate([views, np.full(len(slow), IN_RIGHT, np.uint8)])
-    a, b = body[order, 0] / 2, body[order, 1] / 2
-    corners = np.stack([
-        at + i * a[:, None] * heading[order] + j * b[:, None] * heading[order][:, ::-1] * [-1, 1]
-        for i in (-1, 1) for j in (-1, 1)
-    ])  # fmt: skip
-    z = terrain_heights(s, corners.reshape(-1, 2))[:, 0].reshape(4, -1)
-    boxes = np.column_stack(
-        [at, heading[order], a, b, z.max(axis=0) + body[order, 2], np.zeros(len(at))]
-    )
-    style = np.column_stack(
-        [paint[order], 0.7 * paint[order], np.full(len(at), float(VEHICLE)), 97.0 * order]
-    )
-    middle = np.array([s.x0, s.y0]) + size / 2
-    inside = (np.abs(corners - middle) < size / 2 - 1.0).all((0, 2))
-    keep = street[order] & inside & (z.min(axis=0) > s.water + 0.5)
-    return Objects(boxes[keep], view[keep], style[keep])
 
 
 ROW_STEP = 2.3  # distance of crowns in a row over their mean radius

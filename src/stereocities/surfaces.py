@@ -28,9 +28,9 @@ STEP_M = 0.05  # what a ray enters deeper below a patch's top than this is its s
 
 @inlined
 def patch_top(s, i, j, ax, ay, bx, by, low, high):
-    """Where a ray from above first meets a patch of cell (i, j) between two heights.
+    """z where a ray from above first meets a patch of cell (i, j) between two heights, −1e30:
+    nowhere; number of the patch in the raster; whether its side is met.
 
-    Returns z (−1e30: nowhere), number of the patch in the raster and whether its side is met.
     ``low``, ``high``: z where the ray enters and leaves the cell, from below.
     """
     top, number, is_side = -1e30, -1, False
@@ -307,9 +307,7 @@ def tree_top(trees, n, ax, ay, bx, by):
 
 @inlined
 def cast(s, horizon, ax, ay, bx, by, view, trees, guess):
-    """First surface on a ray from above.
-
-    Returns z, kind, object, face, and of the ground below z and its derivatives along x and y.
+    """First surface on a ray from above: z, kind, object, face; of the ground z and its slopes.
 
     ``view``: bits of the objects seen, as LEFT_VIEW or IN_LIDAR. ``trees``: whether crowns stop
     the ray. ``horizon``: what :func:`horizon` gives for such rays. ``guess``: z near which the
@@ -414,10 +412,8 @@ def in_shadow(s, sun, x, y, z, view):
     bx, by = sun[0] / sun[2], sun[1] / sun[2]
     ax, ay = x - bx * z, y - by * z
     clear = z + 0.02
-    step_x = 1 if bx > 0 else -1
-    step_y = 1 if by > 0 else -1
-    per_x = CELL_M / max(abs(bx), 1e-9)
-    per_y = CELL_M / max(abs(by), 1e-9)
+    step_x, step_y = 1 if bx > 0 else -1, 1 if by > 0 else -1
+    per_x, per_y = CELL_M / max(abs(bx), 1e-9), CELL_M / max(abs(by), 1e-9)
     next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) * (1 / bx)
     next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) * (1 / by)
     while z < s.sun_top[j, i]:

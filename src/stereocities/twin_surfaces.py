@@ -23,9 +23,7 @@ from .surfaces import NOTHING, PATCH_M
 CLASSED_SHARE = 0.01  # of the points: less of a class, and its class was not looked for
 NEIGHBOURS = 10  # by which the plane of a point is told
 THIN_M = 0.4  # one point at most in a square of this side
-SEED_ROUGH_M = (
-    0.12  # rms of the neighbours off their plane: less for a point that a plane begins with
-)
+SEED_ROUGH_M = 0.12  # rms of the neighbours off the plane of a point that one begins with
 OFF_M = 0.18  # of a plane: a point so near belongs to it
 JOIN_M = 0.45  # what no plane took up joins the one beside it, so near
 TURN = math.cos(math.radians(28))  # of the normals within a plane
@@ -167,12 +165,8 @@ def _grow(xyz, near, normal, rough, order, number, planes):
             for k in range(size):
                 number[queue[k]] = -1
             continue
-        planes[count, 0], planes[count, 1], planes[count, 2] = (
-            plane[0] + ox,
-            plane[1] + oy,
-            plane[2] + oz,
-        )
-        planes[count, 3:] = plane[3:]
+        planes[count, 0], planes[count, 1] = plane[0] + ox, plane[1] + oy
+        planes[count, 2], planes[count, 3:] = plane[2] + oz, plane[3:]
         count += 1
     return count
 
@@ -379,20 +373,16 @@ def is_ground(points: Points) -> np.ndarray:
     around = ndimage.median_filter(lowest, 5, mode="nearest")
     lowest = np.where(lowest < around - LOW_M, around, lowest)
     surface, is_object = lowest, np.zeros(lowest.shape, bool)
-    for half in _windows():
+    half = 1
+    while True:  # half widths of the openings, cells
         opened = ndimage.grey_opening(surface, size=2 * half + 1, mode="nearest")
         is_object |= surface - opened > STEEP * half * FILTER_M
         surface = opened
+        if half * FILTER_M >= WIDEST_M:
+            break
+        half = math.ceil(1.5 * half)
     ground = _filled(np.where(is_object, np.inf, lowest))
     return np.abs(points.xyz[:, 2] - ground[j, i]) < NEAR_M
-
-
-def _windows() -> list[int]:
-    """Half widths of the openings, cells: each some half wider than the one before."""
-    halves = [1]
-    while halves[-1] * FILTER_M < WIDEST_M:
-        halves.append(math.ceil(1.5 * halves[-1]))
-    return halves
 
 
 def _filled(heights: np.ndarray) -> np.ndarray:

@@ -47,6 +47,7 @@ POINTS_A_CHUNK = 2_000_000
 TONE = 2.2  # exponent of the tone curve of colours
 MIDDLE = 0.25  # reflectance of a point of median intensity
 DARKEST, BRIGHTEST = 0.04, 0.75  # reflectance
+GIVE_CRS = "give the coordinate system of the points, as --crs EPSG:2154"
 
 
 class Extent(NamedTuple):
@@ -71,38 +72,32 @@ def extent_of(file: str | Path, crs: str = "") -> Extent:
     Raises InputError: no file of points, none in it, or no coordinate system.
     """
     file = Path(file)
+    points = "name a LAS or LAZ file of a place's points"
     if not file.is_file():
-        raise InputError("there is no such file", file=file, remedy="name a LAS or LAZ file")
+        raise InputError("there is no such file", file=file, remedy=points)
     try:
         with laspy.open(file) as source:
             header = source.header
             declared = None if crs else header.parse_crs()
     except (laspy.LaspyException, pyproj.exceptions.CRSError, ValueError) as error:
         raise InputError(
-            f"cannot be read as LAS or LAZ: {error}", file=file, remedy="name a LAS or LAZ file"
+            f"cannot be read as LAS or LAZ: {error}", file=file, remedy=points
         ) from None
     if not header.point_count:
-        raise InputError("has no points", file=file, remedy="name a file of a place's points")
+        raise InputError("has no points", file=file, remedy=points)
     if not crs and declared is None:
-        raise InputError(
-            "declares no coordinate system that an EPSG code or WKT names",
-            file=file,
-            remedy="give the coordinate system of the points, as --crs EPSG:2154",
-        )
+        what = "declares no coordinate system that an EPSG code or WKT names"
+        raise InputError(what, file=file, remedy=GIVE_CRS)
     try:
-        found = pyproj.CRS.from_user_input(crs) if crs else declared
+        full = pyproj.CRS.from_user_input(crs) if crs else declared
     except pyproj.exceptions.CRSError:
-        raise InputError(
-            f"{crs!r} is no coordinate system", file=file, remedy="give one as EPSG:2154"
-        ) from None
-    plan = found.sub_crs_list[0] if found.is_compound else found
+        what = f"{crs!r} is no coordinate system"
+        raise InputError(what, file=file, remedy=GIVE_CRS) from None
+    plan = full.sub_crs_list[0] if full.is_compound else full
     if not (plan.is_projected or plan.is_geographic):
-        raise InputError(
-            f"the coordinate system {plan.name} has no positions in plan",
-            file=file,
-            remedy="give the coordinate system of the points, as --crs EPSG:2154",
-        )
-    axes = found.axis_info
+        what = f"the coordinate system {plan.name} has no positions in plan"
+        raise InputError(what, file=file, remedy=GIVE_CRS)
+    axes = full.axis_info
     upward = axes[2] if len(axes) > 2 else axes[0]
     unit = upward.unit_conversion_factor if plan.is_projected or len(axes) > 2 else 1.0
     return Extent(plan.to_2d(), np.array(header.mins), np.array(header.maxs), float(unit))
@@ -258,11 +253,8 @@ def twin_city(
     middle = (low + high) / 2
     lon, lat, _ = of.to_geodetic(middle[None])[0]
     if not (abs(lon) <= 360 and abs(lat) <= 90):
-        raise InputError(
-            f"lies outside of what {of.crs.name} covers",
-            file=file,
-            remedy="give the coordinate system of the points, as --crs EPSG:2154",
-        )
+        what = f"lies outside of what {of.crs.name} covers"
+        raise InputError(what, file=file, remedy=GIVE_CRS)
     base = math.floor(of.unit_m * low[2])
     frame = LocalFrame(float(lon), float(lat), float(base))
     ends = np.array([[high[0], middle[1], low[2]], [middle[0], high[1], low[2]]])
@@ -284,7 +276,13 @@ def twin_city(
         scenes=(scene,),
         sun_azimuth_deg=sun_deg[0],
         sun_elevation_deg=sun_deg[1],
-        twin=Twin(str(file), crs, half, math.atan2(right[1], right[0]), _read_once(rpcs)),
+        twin=Twin(
+            str(file),
+            crs,
+            half,
+            math.atan2(right[1], right[0]),
+            None if rpcs is None else tuple(str(read_rpc(file).file) for file in rpcs),
+        ),
     )
     cols, rows = size_px or _all_of_it(city, scene, right, up)
     if max(cols, rows) > MOST_PX:
@@ -294,14 +292,6 @@ def twin_city(
             remedy="give a part of it about its middle, as --size 2000 2000, or cut the file",
         )
     return replace(city, scenes=(replace(scene, cols=cols, rows=rows),))
-
-
-def _read_once(rpcs: tuple[str | Path, str | Path] | None) -> tuple[str, str] | None:
-    """The names of files of RPCs that can be read."""
-    if rpcs is None:
-        return None
-    left, right = (str(read_rpc(file).file) for file in rpcs)
-    return left, right
 
 
 def _all_of_it(

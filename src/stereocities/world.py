@@ -30,6 +30,7 @@ from .layout import (
     extent,
     frame_of,
     make_terrain,
+    place_vehicles,
     spectral_noise,
 )
 from .surfaces import (
@@ -153,7 +154,6 @@ def build_surfaces(city: CitySpec) -> Surfaces:
         place_buildings,
         place_canopy,
         place_trees,
-        place_vehicles,
     )
     from .twin_world import place_of
 

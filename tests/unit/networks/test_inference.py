@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import dask.array as da
 import numpy as np
 import pytest
@@ -59,14 +57,6 @@ def test_the_entropy_of_the_softmax_is_an_uncertainty(kind: str) -> None:
         network.expected.register_forward_pre_hook(lambda part, given: (0 * given[0], *given[1:]))
     _, sigma = sure.with_uncertainty(*image, (-64, 64))
     assert np.nanmin(sigma) == pytest.approx(most, rel=1e-4) == np.nanmax(sigma)
-
-
-def test_a_network_without_softmax_has_no_entropy(tmp_path: Path) -> None:
-    made = method("densemapnet")
-    weights.save_weights(tmp_path / "w.pt", made.model, made.network, {})
-    settings = {"weights": str(tmp_path / "w.pt"), "uncertainty": "entropy"}
-    with pytest.raises(InputError, match="densemapnet"):
-        inference.make("mine", "densemapnet", settings, 0)
 
 
 def test_flips_that_agree_leave_no_uncertainty() -> None:

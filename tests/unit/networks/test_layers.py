@@ -56,17 +56,6 @@ def test_strided_convolutions_pad_at_the_end() -> None:
     assert torch.equal(convolution(x), x[..., 1::2, 1::2])
 
 
-def test_ranges_must_be_multiples_of_the_scale() -> None:
-    assert layers.planes((-128, 64), 8) == (-16, 8)
-    for bad in ((-100, 64), (8, 8), (8, -8)):
-        with pytest.raises(ValueError, match="disparity range"):
-            layers.planes(bad, 16)
-    assert layers.planes((-96, 96), 16, 4) == (-6, 6)  # that of US3D, at 1/16 of the resolution
-    for bad in ((-96, 64), (-90, 102)):
-        with pytest.raises(ValueError, match="disparity range"):
-            layers.planes(bad, 16, 4)
-
-
 @pytest.mark.parametrize("planes", [4, 12])  # small, and not
 @pytest.mark.parametrize("stride", [1, 2])
 def test_small_volumes_are_convolved_like_large_ones(planes: int, stride: int) -> None:

@@ -56,10 +56,8 @@ def test_training_lowers_the_loss_and_keeps_the_best(
     assert summary["parameters"] == 621380 and summary["pairs"] == {"train": 3, "val": 1}
     assert load_weights(out / "best.pt")[2]["code"] == "x"
     picture = read_picture(out / "curves.png")
-    assert picture.shape[1] == pytest.approx(7 * 110, rel=0.1) and (picture[0, 0] == 255).all()
     middle = picture.shape[1] // 2  # a curve of the loss, and one of the error beside it
-    assert share_of(picture[:, :middle], "C0") > 1e-3 > share_of(picture[:, :middle], "C1")
-    assert share_of(picture[:, middle:], "C1") > 1e-3 > share_of(picture[:, middle:], "C0")
+    assert share_of(picture[:, :middle], "C0") > 1e-3 < share_of(picture[:, middle:], "C1")
 
 
 SCRIPT = """
@@ -172,8 +170,3 @@ def test_the_loss_counts_labelled_pixels_only() -> None:
     # at half the size: one pixel is labelled, by the mean of its two labels, in its own pixels
     assert loss_of([torch.zeros(1, 2, 2)], disparity, [1.0]).item() == pytest.approx(3.5 - 0.5)
     assert loss_of([output], torch.full((1, 4, 4), float("nan")), [1.0]).item() == 0
-
-
-def test_the_learning_rate_is_halved_every_ten_epochs() -> None:
-    rates = [training_state.learning_rate_of(TrainingSettings(), epoch) for epoch in (0, 9, 10, 25)]
-    assert rates == [1e-3, 1e-3, 5e-4, 2.5e-4]

@@ -9,7 +9,7 @@ import pytest
 import rasterio
 from rasterio.transform import RPCTransformer
 
-from stereocities.camera import LocalFrame, locate, project
+from stereocities.camera import locate, project
 from stereocities.layout import frame_of
 from stereocities.render import prepare
 from stereocities.rpcs import NUMBERS, RATIOS, read_rpc, rpc_camera
@@ -58,25 +58,6 @@ def test_a_camera_sees_as_its_rpcs_do(texts):
     xyz = locate(cam, frame, image, rng.uniform(*heights, 300))
     np.testing.assert_allclose(project(cam, xyz), image, atol=1e-6)
     np.testing.assert_allclose(by_gdal(rpc, frame.to_geodetic(xyz)), image, atol=5e-3)
-
-
-def test_rpcs_are_moved_over_another_place(texts):
-    """A pixel has the size there that it has at home."""
-    rpc = read_rpc(texts[0])
-    moved = rpc.over(4.36, 43.8, 60.0)
-    assert rpc.over(ONE_BOX.lon, ONE_BOX.lat, ONE_BOX.base_height_m) is rpc
-    sizes = []
-    for of, at in (
-        (rpc, (ONE_BOX.lon, ONE_BOX.lat, ONE_BOX.base_height_m)),
-        (moved, (4.36, 43.8, 60.0)),
-    ):
-        frame = LocalFrame(*at)
-        cam = rpc_camera(of, frame, SIZE, (at[2] - 50, at[2] + 100))
-        xyz = locate(
-            cam, frame, np.array([[200.0, 200], [201, 200], [200, 201]]), np.full(3, at[2])
-        )
-        sizes.append(np.hypot(*(xyz[1:] - xyz[0])[:, :2].T))
-    np.testing.assert_allclose(sizes[1], sizes[0], rtol=5e-3)
 
 
 def test_a_twin_by_given_rpcs_shows_its_place(texts, tmp_path):

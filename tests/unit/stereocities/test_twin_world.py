@@ -16,8 +16,6 @@ from stereocities.lidar import simulate_lidar_tile
 from stereocities.render import prepare
 from stereocities.surfaces import (
     GROUND,
-    IN_IMAGES,
-    IN_LIDAR,
     PATCH_M,
     PATCHES_A_CELL,
     ROOF,
@@ -27,7 +25,7 @@ from stereocities.surfaces import (
 )
 from stereocities.truth import BUILT, DEMOLISHED, changes_at, truth_at
 from stereocities.twin_world import twin_city
-from stereocities.world import YOUNG, surfaces_of, top_surface
+from stereocities.world import top_surface
 from stereotruth.core.errors import InputError
 
 from ...synthetic import house_points as place
@@ -145,15 +143,6 @@ def test_buildings_of_a_twin_have_their_dates(house, share, days, reason, change
         roofs = differs & (truth["surface"] == ROOF)
         assert roofs.sum() > 50
         assert not (truth["visible_right"] | truth["hidden_right"])[roofs].any()
-
-
-def test_trees_of_a_twin_are_felled_whole(house):
-    felled = surfaces_of(replace(house, dates=Dates(9.0, 9.0, 0.0, felled=1.0)))
-    assert (felled.tree_view == IN_LIDAR).all() and len(felled.trees) > 50
-    grown = surfaces_of(replace(house, dates=Dates(9.0, 9.0, 0.0, grown=1.0)))
-    young, old = (grown.trees[grown.tree_view == bits] for bits in (IN_LIDAR, IN_IMAGES))
-    base = place.GROUND_Z - house.base_height_m
-    np.testing.assert_allclose(young[:, 2] - base, YOUNG * (old[:, 2] - base), atol=0.1)
 
 
 def test_files_that_no_twin_can_be_made_of_are_refused(tmp_path):
