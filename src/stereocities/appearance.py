@@ -82,7 +82,7 @@ def _is_resurfaced(s, i, j, along_q):
 
 @inlined
 def _in_block(s, n, x, y):
-    """A plan position along the axes of a zone, the numbers of its block, distances to its edges."""
+    """A plan position along the axes of a zone, numbers of its block, distances to its edges."""
     p = x * s.zones[n, 2] + y * s.zones[n, 3]
     q = y * s.zones[n, 2] - x * s.zones[n, 3]
     i, j = np.floor(p / s.zones[n, 4]), np.floor(q / s.zones[n, 5])

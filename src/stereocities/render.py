@@ -22,7 +22,6 @@ from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec, ViewSpec
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc, read_rpc, rpc_camera
 from .surfaces import (
-    CLOSE_M,
     LEFT_VIEW,
     NONE,
     RIGHT_VIEW,
@@ -31,8 +30,6 @@ from .surfaces import (
     direction_of_sun,
     ground_hit,
     horizon,
-    spline,
-    spline_cell,
     terrain_heights,
 )
 from .world import surfaces_of, world_of
@@ -43,9 +40,7 @@ log = logging.getLogger("stereotruth")
 FULL_SCALE = 2047  # 11 bits
 FULL_SCALE_OF_8 = 255
 STRIP_ROWS = 128
-LANES, BLOCK = 8, 64  # rows of the half-pixel raster side by side, columns at a time
-# Of each lane: its ray, the ground, the last step, where in a cell of the spline, coefficients
-AX, AY, BX, BY, Z, ZX, ZY, STEP, F, G, SPLINE = (LANES * k for k in range(11))
+GUESS_ROWS = 8
 RPC_MARGIN_M = 130.0
 FRAME_PX = 30  # of a window of given RPCs around the place
 SHOWN = {"left": LEFT_VIEW, "right": RIGHT_VIEW}
@@ -287,94 +282,34 @@ def ray(cam, line, col):
     return line[0] - bx * line[2], line[1] - by * line[2], bx, by
 
 
-@inlined
-def _lane(work, at):
-    """Four values of one lane, the first of which lies there."""
-    return work[at], work[at + LANES], work[at + 2 * LANES], work[at + 3 * LANES]
-
-
-@inlined
-def _ground_below(s, cam, lines, col, first, ground, before, work):
-    """Rays of a column of all lanes and the ground that they meet, in ``work``.
-
-    ``ground``, ``before`` [LANES]: z of the ground a column and two before, moved on by one; there
-    is none before the ``first`` column. The loop in the middle neither branches nor looks anything
-    up, so that the processor takes all lanes at a time.
-    """
-    c = s.terrain
-    for k in range(LANES):
-        ax, ay, bx, by = ray(cam, lines[k], col)
-        z = ground[k]
-        if not first:  # the ground goes on as it did
-            z += ground[k] - before[k]
-        before[k] = ground[k]
-        i, j, f, g = spline_cell(s, ax + bx * z, ay + by * z)
-        work[AX + k], work[AY + k], work[BX + k], work[BY + k], work[Z + k] = ax, ay, bx, by, z
-        work[F + k], work[G + k] = f, g
-        for m in range(4):
-            for n in range(4):
-                at = SPLINE + (4 * m + n) * LANES + k
-                work[at] = c[np.uint64(j - 1 + m), np.uint64(i - 1 + n)]
-    for k in range(LANES):
-        at = SPLINE + k
-        z, zx, zy = spline(
-            s,
-            work[F + k],
-            work[G + k],
-            _lane(work, at),
-            _lane(work, at + 4 * LANES),
-            _lane(work, at + 8 * LANES),
-            _lane(work, at + 12 * LANES),
-        )
-        step = (z - work[Z + k]) / (1 - zx * work[BX + k] - zy * work[BY + k])
-        work[ZX + k], work[ZY + k], work[STEP + k] = zx, zy, step
-        work[Z + k] += step
-    for k in range(LANES):
-        if abs(work[STEP + k]) >= CLOSE_M:  # rarely
-            work[Z + k], work[ZX + k], work[ZY + k] = ground_hit(
-                s, work[AX + k], work[AY + k], work[BX + k], work[BY + k], work[Z + k]
-            )
-        ground[k] = work[Z + k]
-
-
 @kernel
 def _shade_rows(s, above, shown, cam, first_row, out):
     """Reflectance on the half-pixel raster: out[2 r + a, 2 c + b] at (c, r) − 1/4 + (b, a)/2.
 
     ``shown``: bits of the objects seen. ``first_row`` is the image row of out's row 0; out's column
-    0 is image column −2. Where the ground is follows from where it was a column before. Several
-    rows go side by side, so that the processor need not wait for one to end before it begins with
-    another.
+    0 is image column −2. Where the ground is follows from where it was a column before; at the
+    first column, from where it was at the end of the row GUESS_ROWS before.
     """
-    lines = np.empty((LANES, 12))
-    ground, before = np.zeros(LANES), np.zeros(LANES)
-    work = np.empty(SPLINE + 16 * LANES)
-    hits = np.empty((LANES, BLOCK, 7))
+    line = np.empty(12)
+    last = np.zeros(GUESS_ROWS)
     sun = s.sun[0], s.sun[1], s.sun[2]
-    for r0 in range(0, out.shape[0], LANES):
-        lanes = min(LANES, out.shape[0] - r0)
-        for k in range(LANES):
-            pose(cam, first_row - 0.25 + 0.5 * (r0 + k), lines[k])
-        for c0 in range(0, out.shape[1], BLOCK):
-            columns = min(BLOCK, out.shape[1] - c0)
-            for n in range(columns):
-                col = -2.25 + 0.5 * (c0 + n)
-                _ground_below(s, cam, lines, col, c0 + n == 0, ground, before, work)
-                for k in range(LANES):
-                    for m in range(7):
-                        hits[k, n, m] = work[m * LANES + k]
-            for k in range(lanes):
-                for n in range(columns):
-                    ax, ay, bx, by, ground_z, zx, zy = hits[k, n]
-                    z, kind, index, face = above_ground(
-                        s, above, ax, ay, bx, by, shown, True, ground_z
-                    )
-                    value = 0.1
-                    if kind != NONE:
-                        value = reflectance(
-                            s, sun, shown, ax + bx * z, ay + by * z, z, kind, index, face, (zx, zy)
-                        )
-                    out[r0 + k, c0 + n] = value
+    for r in range(out.shape[0]):
+        pose(cam, first_row - 0.25 + 0.5 * r, line)
+        ground = last[r % GUESS_ROWS]
+        before = ground
+        for c in range(out.shape[1]):
+            ax, ay, bx, by = ray(cam, line, -2.25 + 0.5 * c)
+            guess = ground + (ground - before)  # the ground goes on as it did
+            before = ground
+            ground, zx, zy = ground_hit(s, ax, ay, bx, by, guess)
+            z, kind, index, face = above_ground(s, above, ax, ay, bx, by, shown, True, ground)
+            value = 0.1
+            if kind != NONE:
+                value = reflectance(
+                    s, sun, shown, ax + bx * z, ay + by * z, z, kind, index, face, (zx, zy)
+                )
+            out[r, c] = value
+        last[r % GUESS_ROWS] = ground
 
 
 def _decimate(half: np.ndarray, psf_px: float) -> np.ndarray:

@@ -174,27 +174,29 @@ def direction_of_sun(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
 
 
 @inlined
-def spline_cell(s, x, y):
-    """Column and row of the spline's cell over a plan position, and where in it that lies."""
-    per_step = 1 / s.step
-    u, v = (x - s.x0) * per_step, (y - s.y0) * per_step
-    i = min(max(int(np.floor(u)), 1), s.terrain.shape[1] - 3)
-    j = min(max(int(np.floor(v)), 1), s.terrain.shape[0] - 3)
-    return i, j, u - i, v - j
+def _dot(a, c, j, i):
+    """Product with four coefficients of a row."""
+    return (
+        a[0] * c[j, i]
+        + a[1] * c[j, i + np.uint64(1)]
+        + a[2] * c[j, i + np.uint64(2)]
+        + a[3] * c[j, i + np.uint64(3)]
+    )
 
 
 @inlined
-def _dot(a, c):
-    return a[0] * c[0] + a[1] * c[1] + a[2] * c[2] + a[3] * c[3]
-
-
-@inlined
-def spline(s, f, g, c0, c1, c2, c3):
-    """Terrain z and its derivatives at (f, g) of a cell, by the four rows of coefficients around.
+def terrain_at(s, x, y):
+    """Terrain z and its derivatives along x and y.
 
     From six times the spline's weights and twice their derivatives: a division each would be half
     of the time.
     """
+    c = s.terrain
+    per_step = 1 / s.step
+    u, v = (x - s.x0) * per_step, (y - s.y0) * per_step
+    i = min(max(int(np.floor(u)), 1), c.shape[1] - 3)
+    j = min(max(int(np.floor(v)), 1), c.shape[0] - 3)
+    f, g = u - i, v - j
     f1, g1 = 1 - f, 1 - g
     a = f1 * f1 * f1, 4 + f * f * (3 * f - 6), 4 + f1 * f1 * (3 * f1 - 6), f * f * f
     d = -f1 * f1, f * (3 * f - 4), f1 * (4 - 3 * f1), f * f
@@ -202,32 +204,15 @@ def spline(s, f, g, c0, c1, c2, c3):
     b2, b3 = 4 + g1 * g1 * (3 * g1 - 6), g * g * g
     e0, e1 = -g1 * g1, g * (3 * g - 4)
     e2, e3 = g1 * (4 - 3 * g1), g * g
-    r0, r1, r2, r3 = _dot(a, c0), _dot(a, c1), _dot(a, c2), _dot(a, c3)
-    q0, q1, q2, q3 = _dot(d, c0), _dot(d, c1), _dot(d, c2), _dot(d, c3)
+    # unsigned: signed indices are tested for wrapping around, at half the cost of the spline
+    i0, j0 = np.uint64(i - 1), np.uint64(j - 1)
+    j1, j2, j3 = np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
+    r0, r1, r2, r3 = _dot(a, c, j0, i0), _dot(a, c, j1, i0), _dot(a, c, j2, i0), _dot(a, c, j3, i0)
+    q0, q1, q2, q3 = _dot(d, c, j0, i0), _dot(d, c, j1, i0), _dot(d, c, j2, i0), _dot(d, c, j3, i0)
     z = b0 * r0 + b1 * r1 + b2 * r2 + b3 * r3
     zx = b0 * q0 + b1 * q1 + b2 * q2 + b3 * q3
     zy = e0 * r0 + e1 * r1 + e2 * r2 + e3 * r3
-    per_step = 1 / s.step
     return z * (1 / 36), zx * (per_step / 12), zy * (per_step / 12)
-
-
-@inlined
-def terrain_at(s, x, y):
-    """Terrain z and its derivatives along x and y."""
-    i, j, f, g = spline_cell(s, x, y)
-    c = s.terrain
-    # unsigned: signed indices are tested for wrapping around, at half the cost of the spline
-    j0, j1, j2, j3 = np.uint64(j - 1), np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
-    i0, i1, i2, i3 = np.uint64(i - 1), np.uint64(i), np.uint64(i + 1), np.uint64(i + 2)
-    return spline(
-        s,
-        f,
-        g,
-        (c[j0, i0], c[j0, i1], c[j0, i2], c[j0, i3]),
-        (c[j1, i0], c[j1, i1], c[j1, i2], c[j1, i3]),
-        (c[j2, i0], c[j2, i1], c[j2, i2], c[j2, i3]),
-        (c[j3, i0], c[j3, i1], c[j3, i2], c[j3, i3]),
-    )
 
 
 @inlined

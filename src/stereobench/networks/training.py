@@ -37,9 +37,7 @@ from .training_state import (
     TrainingJob,
     TrainingSettings,
     TrainingState,
-    check_crop,
     freeze_parts,
-    learning_rate_of,
     make_optimiser,
     publish_training,
     read_state,
@@ -91,7 +89,11 @@ def train(
     network or the pairs, or if the loss is no number any more.
     """
     network = start(model, training)
-    check_crop(network, training.crop_px)
+    if any(side % network.divisor for side in training.crop_px or ()):
+        raise InputError(
+            f"training.crop_px {list(training.crop_px)}: no multiples of {network.divisor} px",
+            remedy=f"{type(network).__name__} needs them",
+        )
     data = LabelledPairs.of(
         dataset,
         "train",
@@ -180,7 +182,8 @@ def _run(job: TrainingJob, rank: int, network: nn.Module, device: torch.device) 
     most_seconds = np.inf if training.hours is None else 3600 * training.hours
     while state.epoch < training.epochs and state.seconds < most_seconds:
         for group in optimiser.param_groups:
-            group["lr"] = learning_rate_of(training, state.epoch)
+            halvings = state.epoch // training.halve_every_epochs
+            group["lr"] = training.learning_rate * 0.5**halvings
         network.train()
         for part in frozen:  # with the statistics that its weights were trained with
             part.eval()

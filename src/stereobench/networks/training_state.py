@@ -6,7 +6,6 @@ State: start, file, what is frozen, learning rate. Left are weights, curves, a f
 from __future__ import annotations
 
 import json
-import logging
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -48,18 +47,7 @@ class TrainingSettings(Training):
         return self.model_dump(exclude=set(left_out))
 
 
-def check_crop(network: nn.Module, crop: tuple[int, int] | None) -> None:
-    """InputError unless the sides of ``crop`` fit the network."""
-    if crop and any(side % network.divisor for side in crop):
-        raise InputError(
-            f"training.crop_px {list(crop)}: no multiples of {network.divisor} px",
-            remedy=f"{type(network).__name__} needs them",
-        )
-
-
 log = logging.getLogger("stereotruth")
-
-
 FORMAT = 1  # of the state
 BETAS = (0.9, 0.999)
 
@@ -89,11 +77,6 @@ def read_state(path: Path, key: str) -> dict[str, Any] | None:
         log.info("settings or data are others than before: the training starts anew")
         return None
     return record
-
-
-def learning_rate_of(training: TrainingSettings, epoch: int) -> float:
-    """Of an epoch: halved every ``halve_every_epochs``."""
-    return training.learning_rate * 0.5 ** (epoch // training.halve_every_epochs)
 
 
 def freeze_parts(network: nn.Module, frozen: Sequence[str]) -> list[nn.Module]:

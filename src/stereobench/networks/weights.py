@@ -7,14 +7,10 @@ In files of Keras (``.h5``), names number the layers in the order of their makin
 from file to file; what is stable is the order in which a network calls them. So weights are taken
 by order: for each part of the network first the trainable ones (kernel, then bias or scale and
 shift), then the statistics of batch normalisation. Every shape must fit.
-
-    python -m stereobench.networks.weights StereoNet.h5 stereonet.pt \\
-        --kind stereonet --disparity-range -128 64
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import math
 from collections.abc import Iterator, Mapping
@@ -32,10 +28,9 @@ from torch import nn
 from stereotruth.core.errors import InputError, install_extra
 from stereotruth.core.products.files import atomic_file
 
-from ..methods.kinds import KINDS, NETWORKS
+from ..methods.kinds import KINDS
 from .layers import TRAINED
 
-SCALINGS = ("standardise", "us3d", "dfc2019")
 SAMPLES = 1 << 22  # pixels that a quantile is taken from
 GREY = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
 
@@ -181,8 +176,7 @@ def load_weights(path: str | Path) -> tuple[SavedNetwork, nn.Module, dict[str, A
         raise InputError(
             f"not a weight file of this version ({type(error).__name__})",
             file=path,
-            remedy="train the network again; Keras weights (.h5) are converted by "
-            "python -m stereobench.networks.weights",
+            remedy="train the network again, or name weights of Keras (.h5)",
         ) from error
     return model, network, record["provenance"]
 
@@ -363,28 +357,3 @@ def read_keras(
     network = model.build()
     load_keras(network, path)
     return model, network
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """The command of the module's docstring."""
-    parser = argparse.ArgumentParser(description="Keras weights (.h5) to a weight file (.pt)")
-    parser.add_argument("weights", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--kind", choices=sorted(NETWORKS), default="stereonet")
-    parser.add_argument("--disparity-range", type=int, nargs=2, default=(-128, 64), metavar="PX")
-    parser.add_argument("--scaling", choices=SCALINGS, default=None)
-    given = parser.parse_args(arguments)
-    span = tuple(given.disparity_range)
-    try:
-        model, network = read_keras(given.weights, given.kind, given.scaling, span)
-    except InputError as error:
-        parser.exit(1, f"error: {error}\n")
-    save_weights(given.out, model, network, {"source": given.weights.name})
-    print(
-        f"{given.out}: {model.kind}, {model.channels} channels, "
-        f"{sum(p.numel() for p in network.parameters())} parameters"
-    )
-
-
-if __name__ == "__main__":
-    main()

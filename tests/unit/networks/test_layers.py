@@ -40,10 +40,10 @@ def test_gradients_of_volumes_are_those_of_finite_differences(volume) -> None:
 
 def test_soft_argmin_is_the_expectation() -> None:
     cost = torch.tensor([0.0, np.log(3.0)]).view(1, 2, 1, 1)  # probabilities 3/4 and 1/4
-    assert layers.soft_argmin(cost, -2.0, 4.0).item() == pytest.approx(-2 + 4 * 0.25)
+    assert layers.SoftArgmin()(cost, -2.0, 4.0).item() == pytest.approx(-2 + 4 * 0.25)
     sharp = torch.full((1, 5, 1, 1), 100.0)
     sharp[0, 3] = 0
-    assert layers.soft_argmin(sharp, -1.0).item() == pytest.approx(2)
+    assert layers.SoftArgmin()(sharp, -1.0).item() == pytest.approx(2)
 
 
 def test_strided_convolutions_pad_at_the_end() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import rasterio
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from stereocities.render import LANES, _shade_rows, prepare
+from stereocities.render import _shade_rows, prepare
 from stereocities.truth import open_truth
 
 from ...synthetic.small_cities import GROUND, ROOF, TOWN
@@ -45,10 +45,9 @@ def test_views_look_alike_where_both_see_the_surface(town: Path) -> None:
 
 
 def test_a_row_is_the_same_whatever_rows_are_beside_it() -> None:
-    """LANES rows go side by side, and none has a say in another."""
     ready = prepare(TOWN, TOWN.scenes[0])
     camera = ready.left
-    shown = [np.empty((rows, 2 * camera.cols), np.float32) for rows in (3 * LANES, LANES + 3)]
+    shown = [np.empty((rows, 2 * camera.cols), np.float32) for rows in (24, 11)]
     for half, first in zip(shown, (100.0, 102.5)):
         _shade_rows(camera.surfaces, camera.horizon, camera.shown, camera.cam, first, half)
     np.testing.assert_array_equal(shown[1], shown[0][5 : 5 + len(shown[1])])
