@@ -6,6 +6,7 @@ State: start, file, what is frozen, learning rate. Left are weights, curves, a f
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
