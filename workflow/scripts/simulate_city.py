@@ -1,7 +1,7 @@
 """What stands in a synthetic city, for the jobs that look at it."""
 
-from stereocities.world import write_surfaces
 from stereocities.cities import city_of
+from stereocities.world import write_surfaces
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 
