@@ -23,9 +23,7 @@ rule predict_scene:
         script=content_of("../scripts/predict_scene.py"),
         method=lambda w: method_entry(w.method, prediction_dataset()),
         settings=lambda w: scene_prediction(),
-        code=lambda w: source_digest(
-            "stereobench.methods.predict_scene", *method_modules(w.method)
-        ),
+        code=lambda w: source_digest("stereobench.methods.predict_scene", *method_modules(w.method)),
     message:
         "Disparities of scene {wildcards.scene} by {wildcards.method}"
     script:
