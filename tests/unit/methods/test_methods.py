@@ -15,7 +15,7 @@ from stereobench.methods import kinds
 from stereobench.methods.kinds import KINDS
 from stereobench.methods.matcher import Matcher
 from stereobench.methods.methods import MovedMethod, make_method, with_polarity
-from stereobench.methods.sgm import SemiGlobalMatcher, grey_mapping, to_8_bits
+from stereobench.methods.sgm import SemiGlobalMatcher, grey_mapping
 from stereobench.methods.user_methods import FunctionMethod
 from stereotruth.core.errors import InputError
 
@@ -150,34 +150,6 @@ def test_a_mirrored_matcher_sees_flipped_images_and_gives_disparities_of_the_lef
     assert asked == [(11, 111) if span == (-110, -10) else (0, span[1] - span[0])]
 
 
-class PositiveOpenCV:
-    """OpenCV's SGM as it is: nothing where the range of matches leaves the right image."""
-
-    margin_px = 128
-    invalid_outside = True
-
-    def scaling(self, left, right):
-        return grey_mapping(left, right)
-
-    def __call__(self, left, right, disparity_range, scaling=None):
-        assert disparity_range[0] == 0 and scaling is not None
-        opencv = SemiGlobalMatcher().opencv(disparity_range)
-        found = opencv.compute(*(to_8_bits(image, scaling) for image in (left, right)))
-        return np.where(found < 0, np.nan, found / np.float32(16)).astype(np.float32)
-
-
-def test_opencv_of_positive_disparities_gives_that_of_both_signs_but_next_to_the_right_rim(pair):
-    expected = SemiGlobalMatcher()(*pair, RANGE)
-    method = with_polarity("p", PositiveOpenCV(), "positive")
-    assert method.scaling(*pair) == grey_mapping(*pair) and method.margin_px == 128
-    found = method(*pair, RANGE)
-    same = (np.abs(found - expected) <= 1e-3) | (np.isnan(found) & np.isnan(expected))
-    assert np.mean(np.isfinite(expected)) > 0.5
-    assert same[:, :30].all() and np.mean(same) > 0.99
-    # without more columns, those whose range of matches leaves the image would be lost
-    assert np.isfinite(found[:, :30]).any()
-
-
 def test_what_matches_outside_is_kept_or_not(pair):
     match = np.indices(SHAPE)[1] - patches()
     inside = (match >= 0) & (match < SHAPE[1])
@@ -191,6 +163,7 @@ def test_what_matches_outside_is_kept_or_not(pair):
     found = with_polarity("t", function, "positive", "invalid")(*pair, RANGE)
     assert np.array_equal(np.isfinite(found), inside) and 0.1 < np.mean(inside) < 0.9
     method = make_method("s", {"kind": "sgm", "polarity": "positive", "licence": "MIT"})
-    assert isinstance(method, MovedMethod)
+    assert isinstance(method, MovedMethod) and method.margin_px == SemiGlobalMatcher.margin_px
+    assert method.scaling(*pair) == grey_mapping(*pair)
     found = method(*pair, RANGE)
     assert np.isnan(found[~inside & (np.abs(found - patches()) < 0.4)]).all()

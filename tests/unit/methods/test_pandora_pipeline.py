@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import gc
 import json
 
 import numpy as np
@@ -103,18 +102,6 @@ def test_the_last_step_of_one_s_own_pipeline_tells_the_uncertainty(found, tmp_pa
     assert none.with_uncertainty(left, right, RANGE)[1] is None
 
 
-def test_no_cost_volume_of_a_pair_stays_in_memory():
-    _, left, right = images()
-    matcher = method()
-    gc.disable()
-    try:
-        matcher(left, right, RANGE)
-    finally:
-        gc.enable()
-    machine = pandora_pipeline.PandoraMachine
-    assert not any(isinstance(each, machine) for each in gc.get_objects())
-
-
 def test_pipelines_that_pandora_does_not_take_are_refused(tmp_path):
     file = tmp_path / "mine.json"
     wrong = {"pipeline": {"disparity": {"disparity_method": "wta"}}}
@@ -123,12 +110,6 @@ def test_pipelines_that_pandora_does_not_take_are_refused(tmp_path):
             file.write_text(content)
         with pytest.raises(InputError, match=r"mine\.json"):
             method(pipeline=str(file))
-
-
-def test_mccnn_that_is_not_installed_names_its_extra(monkeypatch):
-    monkeypatch.setattr(pandora_pipeline, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"mc_cnn.*the extra mccnn"):
-        method(pipeline="mccnn")
 
 
 @pytest.mark.slow

@@ -138,15 +138,6 @@ def test_a_killed_job_goes_on_where_it_was(images, fresh, tmp_path, monkeypatch)
     assert {path.name for path in tmp_path.iterdir()} == {"sgm.zarr", ".sgm.zarr.work"}
 
 
-def test_a_lost_block_needs_the_tiles_around_it(images, fresh, carried, tmp_path, monkeypatch):
-    out = carried
-    (tmp_path / ".sgm.zarr.work" / "store" / "disparity" / "c" / "1" / "2").write_bytes(b"spoilt")
-    made = tiles_made(monkeypatch)
-    predict(*images, out, **GIVEN)
-    assert sorted(made) == [(0, 1), (0, 2), (1, 1), (1, 2)]
-    assert tree(out) == tree(fresh)
-
-
 def test_a_function_is_made_anew_when_its_file_changes(images, tmp_path, monkeypatch):
     module = tmp_path / "mine.py"
     text = "import numpy as np\n\ndef flat(left, right, r):\n    return np.full(left.shape, {})\n"

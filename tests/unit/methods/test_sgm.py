@@ -12,7 +12,6 @@ from stereobench.methods.sgm import (
     GreyMapping,
     SemiGlobalMatcher,
     grey_mapping,
-    peak_ratio,
     to_8_bits,
 )
 from stereotruth.core.errors import InputError
@@ -152,14 +151,3 @@ def test_uncertainties_are_larger_where_the_images_differ(kind):
     assert np.nanmedian(bad) > 3 * np.nanmedian(good)
     if kind == "left_right":
         assert np.nanmedian(good) < 0.1
-
-
-@pytest.mark.parametrize("limits", [(-40, -8), (4, 36)])
-def test_the_peak_ratio_of_a_shift_is_small_in_any_range(limits):
-    shift = sum(limits) // 2 + 2
-    left, right = pair(shift, np.uint8)
-    found = np.full((H, W), shift, np.float32)
-    match = np.arange(W) - shift
-    seen = (match >= 8) & (match < W - 8)
-    assert np.median(peak_ratio(found, left, right, limits)[5:-5][:, seen]) < 0.2
-    assert np.median(peak_ratio(found + 4, left, right, limits)[5:-5][:, seen]) == 1

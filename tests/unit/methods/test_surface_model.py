@@ -17,7 +17,6 @@ from stereobench.methods.surface_model import (
 )
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
-from stereotruth.epipolar.intersection import intersect
 from stereotruth.epipolar.model import EpipolarModel
 
 from ...synthetic.cameras import HEIGHT
@@ -151,31 +150,6 @@ def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch)
     assert len(before) == 2
     assert out.read_bytes() == (tmp_path / "fresh.tif").read_bytes()
     assert {p.name for p in tmp_path.iterdir()} == {"d.zarr", "fresh.tif", "dsm.tif"}
-
-
-@pytest.mark.slow
-def test_one_wild_disparity_costs_no_more_than_its_place(model, of_plane, tmp_path, monkeypatch):
-    """It widens the window of every block; parts that cannot reach a block are left out."""
-    monkeypatch.setattr(surface_model, "CHUNK", 128)
-    monkeypatch.setattr(surface_model, "SHARD", 128)
-    monkeypatch.setattr(surface_model, "PART", 32)
-    pixels: list[int] = []
-
-    def counted(model, disparity, row=0, col=0):
-        pixels.append(disparity.size)
-        return intersect(model, disparity, row, col)
-
-    monkeypatch.setattr(surface_model, "intersect", counted)
-    wild = of_plane.copy()
-    wild[200, 200] += 700.0
-    work = {}
-    for name, d in (("calm", of_plane), ("wild", wild)):
-        pixels.clear()
-        write_dsm(write_grid(tmp_path / f"{name}.zarr", model, d), tmp_path / f"{name}.tif")
-        work[name] = sum(pixels)
-    assert work["wild"] < 1.25 * work["calm"]
-    calm, wild = (read(tmp_path / f"{name}.tif")[0] for name in ("calm", "wild"))
-    assert abs(np.isfinite(calm).sum() - np.isfinite(wild).sum()) < 20  # the hole of the wild one
 
 
 def test_grids_that_say_too_little_are_refused(model, tmp_path):

@@ -24,17 +24,6 @@ def test_tiles_see_all_that_the_method_needs(block, overlap):
     assert np.abs(found - truth)[known].max() < 1e-3
 
 
-def test_a_right_part_beyond_the_image_is_no_loss():
-    """At the left edge with a negative offset the matches lie far to the right, and so on."""
-    for constant in (-60.0, 60.0):
-        truth = np.full(SHAPE, constant)
-        left, right, known = coded(truth)
-        given = {"block": 64, "overlap": 16, "offset": int(constant)}
-        found = match(Exact(), left, right, (-4, 4), **given)
-        assert np.array_equal(np.isfinite(found), known)
-        assert np.nanmax(np.abs(found - truth)) < 1e-3
-
-
 def test_weights_add_up_and_what_disagrees_is_not_mixed():
     tiling = Tiling((100, 130), 32, 16)
     rng = np.random.default_rng(1)

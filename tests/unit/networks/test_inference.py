@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereobench.methods.kinds import NETWORKS
-from stereobench.networks import inference, weights
+from stereobench.networks import weights
 from stereobench.networks.inference import NetworkMethod
 from stereobench.networks.weights import SavedNetwork
 from stereotruth.core.errors import InputError
@@ -97,13 +97,3 @@ def test_ranges_are_widened_to_the_networks_planes(kind: str) -> None:
     first = {"stereonet": -104, "psmnet": -104, "hmsmnet": -112}[kind]
     with pytest.raises(InputError, match=rf"multiples of .* take \({first}, "):
         SavedNetwork(kind, (-103, 90)).build()
-
-
-def test_a_processor_takes_float32_for_what_it_does_not_have(monkeypatch, caplog) -> None:
-    for had, precision in ((True, "bfloat16"), (False, "float32")):
-        monkeypatch.setattr(inference, "_is_computed", lambda precision, had=had: had)
-        assert inference.precision_of("bfloat16", CPU) == precision
-        assert ("no bfloat16" in caplog.text) == (not had)
-    monkeypatch.undo()
-    assert inference._is_computed("float32") and inference.precision_of(None, CPU) == "float32"
-    assert inference.precision_of("bfloat16", torch.device("cuda")) == "bfloat16"

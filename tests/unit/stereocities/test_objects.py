@@ -90,19 +90,6 @@ def test_the_top_of_a_rough_crown_is_the_highest_of_its_ellipsoids_on_the_ray() 
         assert z[np.argmax(inside)] == pytest.approx(point[2], abs=0.003)
 
 
-def test_a_canopy_has_as_many_crowns_as_it_says() -> None:
-    for arrangement in ("single", "rows", "forest"):
-        canopy = replace(CANOPY, arrangement=arrangement, lobes=0)
-        city = replace(OPEN, character=replace(OPEN.character, canopy=canopy), margin_m=400.0)
-        s = build_surfaces(city)
-        near = np.abs(s.trees[:, :2]).max(axis=1) < 250.0  # all of it within the margin
-        expected = 500.0**2 / CANOPY.ground_m2
-        assert near.sum() == pytest.approx(expected, rel=0.5 if arrangement == "forest" else 0.1)
-        cells = np.histogram2d(*s.trees[near, :2].T, bins=16)[0]
-        clustering = cells.var() / cells.mean()
-        assert (clustering > 2.0) == (arrangement == "forest")
-
-
 def test_a_share_of_the_pulses_passes_crowns(tmp_path: Path) -> None:
     """What lies below the tops: a porous city against the same one with closed crowns."""
     share = []
