@@ -47,6 +47,7 @@ SHOWN = {"left": LEFT_VIEW, "right": RIGHT_VIEW}
 RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
 LEFT_COLLAR, RIGHT_COLLAR = 1, 2  # see in_collar
 COLLARS = {"left": LEFT_COLLAR, "right": RIGHT_COLLAR}
+View = tuple[str, np.ndarray, int, int]  # an image's name, packed camera, columns and rows
 NOISE_SEEDS = {"left": 1, "right": 0}
 
 
@@ -142,15 +143,6 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
     return ImagedScene(city, scene, frame, surfaces, *cameras)
 
 
-class View(NamedTuple):
-    """One of two images: its name, packed camera, columns and rows."""
-
-    name: str
-    cam: np.ndarray
-    cols: int
-    rows: int
-
-
 def _on_a_pass(scene: SceneSpec, frame: LocalFrame, relief: Relief) -> list[View]:
     """Both images of a scene as GaoFen-7 takes them on one pass."""
     target = np.array([*scene.centre_m, relief.middle])
@@ -168,7 +160,7 @@ def _on_a_pass(scene: SceneSpec, frame: LocalFrame, relief: Relief) -> list[View
     ):
         flown = Pass.drawn(view, scene.pose_seed, ascending=scene.ascending)
         cam = aim(frame, target, flown, gsd=gsd, cols=cols, rows=rows)
-        views.append(View(view, cam, cols, rows))
+        views.append((view, cam, cols, rows))
     return views
 
 
@@ -189,7 +181,7 @@ def _by_rpcs(city: CitySpec, frame: LocalFrame, relief: Relief) -> list[View]:
         first = np.floor(image.min(axis=0)).astype(int) - FRAME_PX
         cols, rows = (np.ceil(image.max(axis=0)).astype(int) + FRAME_PX - first).tolist()
         cam = rpc_camera(rpc.cropped(*first.tolist()), frame, (cols, rows), heights)
-        views.append(View(view, cam, cols, rows))
+        views.append((view, cam, cols, rows))
     return views
 
 

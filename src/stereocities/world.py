@@ -12,7 +12,6 @@ from __future__ import annotations
 import logging
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -282,20 +281,16 @@ YOUNG = 0.45  # size of a crown before it has grown, over its size then
 EDGE_M = 4.0  # of a field's block, where its crop ends
 
 
-class Moments(NamedTuple):
-    """Bits of the worlds ``before`` and ``after`` the moments [n] at which things change."""
+def _moments(city: CitySpec, moment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bits of the worlds before and after the moments [n] at which things change.
 
-    before: np.ndarray
-    after: np.ndarray
-
-
-def _moments(city: CitySpec, moment: np.ndarray) -> Moments:
-    """``moment``: in (0, 1], of the time from the first date to the last."""
+    ``moment``: in (0, 1], of the time from the first date to the last.
+    """
     before = np.zeros(moment.shape, np.uint8)
     for world, bit in WORLDS.items():
         before |= np.where(city.dates.passed(world) < moment, bit, 0).astype(np.uint8)
     after = np.uint8(IN_LEFT | IN_RIGHT | IN_LIDAR) & ~before
-    return Moments(_both_images(before), _both_images(after))
+    return _both_images(before), _both_images(after)
 
 
 def _both_images(view: np.ndarray) -> np.ndarray:

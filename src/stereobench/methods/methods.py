@@ -1,20 +1,10 @@
 """From a configuration entry (``benchmark.methods.<name>``) to a stereo method of any range.
 
 A method is a :class:`.matcher.Matcher`; :mod:`.kinds` lists the kinds of entries, and names the
-module that makes the methods of each.
-
-Methods that see positive disparities only take any range with ``polarity: positive``. For a range
-[low, high) with low < 0, the right image is moved by low columns against the left one, so that
-every disparity is larger by −low, and what the method finds is moved back. The images are widened
-rather than cut, with the grey of their edges: the left one by high − low columns before its first
-(high at least 0), so that the match of each of its pixels lies in the widened right image at every
-disparity of the range; the right one by max(high, 0) columns before and −low after. Both get one
-more column after that (:data:`RIM_PX`), since some methods know no gradient in the last one.
-Columns that were added are cut from the result.
-
-``polarity: mirrored`` is for pairs whose disparity falls with height. Both images are flipped, x
-becomes w − 1 − x, so that the disparity becomes −d, still of the left image's pixels. The method is
-asked as with ``positive`` in [1 − high, 1 − low), and its result is flipped back and changes sign.
+module that makes the methods of each. Methods that see positive disparities only are given wider
+images, the right one moved against the left one, and what they find is moved back
+(``polarity: positive``); with ``polarity: mirrored`` both images are flipped besides, which turns
+the sign of the disparity. config/README.md has the columns that are added.
 """
 
 from __future__ import annotations

@@ -1,29 +1,16 @@
 """Stereo methods of the user's own: a program, or a function; and the maps that programs write.
 
-**A program** (kind ``command``) has an environment or container of its own. ``command`` of an entry
-is split into words as a shell does, but no shell runs it. In each word, ``{left}`` and ``{right}``
-are files of the images (TIFF of the images' own type), ``{out}`` the file that the disparities
-x_left − x_right go to ([h, w] px, NaN, infinity or a tagged nodata where there is none;
-``suffix``: TIFF, NumPy's .npy or .pfm), ``{low}`` and ``{high}`` the range (the second excluded),
-``{threads}`` the threads that it may use. With ``uncertainty: true`` it also writes the standard
-uncertainty of each disparity in px to ``{uncertainty}``, a map as the other one.
+config/README.md says what a program (kind ``command``) is told and what it writes, and which
+functions are taken (kind ``function``).
 
-``pairs: each``: the program is called for each pair. ``pairs: file``: it is called once for up to
-``MOST_PAIRS`` pairs, and ``{pairs}`` is a CSV file without header, a row
-``left,right,out[,uncertainty]`` for each. The results of a program that fails are kept but for the
-last, which may be half written.
+The results of a program that fails are kept but for the last, which may be half written. The
+seconds of a pair are those of its call, with the start of the program; with ``pairs: file`` they
+are the time between its result and that of the row before. Memory is that of the program and of
+those that it started, looked at every ``POLL_SECONDS``; programs in containers of a daemon (Docker)
+are not seen.
 
-The seconds of a pair are those of its call, with the start of the program; with ``pairs: file``
-they are the time between its result and that of the row before. Memory is that of the program and
-of those that it started, looked at every ``POLL_SECONDS``; programs in containers of a daemon
-(Docker) are not seen.
-
-**A function** (kind ``function``) is ``package.module:name`` (modules of the working directory are
-found), ``path.py:name``, or an entry point of the group ``stereotruth.methods``. It takes
-``(left, right, disparity_range)`` and the entry's ``options`` as keyword arguments, and returns the
-disparity as :class:`.matcher.Matcher` says; or a tuple of it and of its standard uncertainty in px,
-[h, w] as well. What has ``scaling`` and ``margin_px`` is taken for a Matcher as it is; of a class,
-the options make the object.
+What a function names may be an object with ``scaling`` and ``margin_px``, which is taken for a
+:class:`.matcher.Matcher` as it is; of a class, the options make the object.
 """
 
 from __future__ import annotations
