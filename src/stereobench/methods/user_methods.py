@@ -31,7 +31,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import psutil
 from numpy.typing import NDArray
@@ -156,6 +155,8 @@ class CommandMethod(UncertainMatcher):
 
     def _written(self, folder: Path, pair: ImagePair) -> list[Path]:
         """The files of a pair: images, which are written, and results."""
+        import cv2  # slow to import, and who reads results needs none
+
         ends = ("left.tif", "right.tif", f"disparity{self._suffix}", f"uncertainty{self._suffix}")
         files = [folder / f"{pair.name}_{end}" for end in ends[: len(self._columns)]]
         for file, image in zip(files, (pair.left, pair.right)):
