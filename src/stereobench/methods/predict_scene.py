@@ -1,11 +1,11 @@
-"""A stereo method over the rectified images of a whole scene, in blocks that outlive their job.
+"""A stereo method over the rectified images of a whole scene, in tiles that outlive their job.
 
-Work goes in two rounds over the grid, both kept as :mod:`stereotruth.core.products.resumable_grids`
-keeps blocks: the method makes the tiles (:mod:`stereobench.methods.tiling`), side by
-side in a grid of their own, one to a file; then the blocks are blended from the tiles that reach
-into them. Memory is that of the tiles at work. A job that was killed goes on with the tiles that
-lack; the result has the same bytes for any number of workers and kills, as far as the method itself
-gives the same for the same tile (SGM does; PyTorch does on one machine).
+The method makes the tiles (:mod:`.tiling`), side by side in a grid of their own, one to a file,
+kept as :mod:`stereotruth.core.products.resumable_grids` keeps blocks until the scene is whole; then
+the blocks of the scene are blended from the tiles that reach into them. Memory is that of the tiles
+at work. A job that was killed goes on with the tiles that lack; the result has the same bytes for
+any number of workers and kills, as far as the method itself gives the same for the same tile (SGM
+does; PyTorch does on one machine).
 """
 
 from __future__ import annotations
@@ -53,15 +53,6 @@ LAYERS = {
         },
     )
 }
-
-
-def identity(entry: Mapping[str, Any], files: Sequence[Path]) -> str:
-    """Digest of a method's configuration entry and of its files' content."""
-    return digest({"settings": dict(entry), "files": [file_sha256(path) for path in files]})
-
-
-def _image_content(attrs: Mapping[str, Any]) -> str:
-    return attrs.get("content") or digest(dict(attrs.get("provenance", {})))
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,10 +195,19 @@ def predict_scene(
     job = replace(start, scaling=scaling)
     parameters = _parameters(job, settings)
     files = [file for file in kind.files(entry) if file.is_file()]
+    made_of = {
+        name: digest(dict(attrs.get("provenance", {})))
+        for name, attrs in (("left", left_attrs), ("right", right_attrs))
+    }
     content = digest(
         {
-            "images": [_image_content(attrs) for attrs in (left_attrs, right_attrs)],
-            "method": identity(entry, files),
+            "images": [
+                attrs.get("content") or made_of[name]
+                for name, attrs in (("left", left_attrs), ("right", right_attrs))
+            ],
+            "method": digest(
+                {"settings": dict(entry), "files": [file_sha256(path) for path in files]}
+            ),
             "range": parameters["disparity_range"],
             "margin": parameters["margin_px"],
             "tiling": [settings.block_px, settings.overlap_px],
@@ -221,11 +221,7 @@ def predict_scene(
             job, content, moved.offsets, (unfinished, tiles), (scheduler, workers)
         )
         summary = _summary(unfinished.results(windows), shape, moved)
-        inputs = {
-            name: digest(dict(attrs.get("provenance", {})))
-            for name, attrs in (("left", left_attrs), ("right", right_attrs))
-        }
-        inputs |= {name: file_sha256(path) for name, path in names_of(files).items()}
+        inputs = made_of | {name: file_sha256(path) for name, path in names_of(files).items()}
         attrs = {
             "kind": "prediction",
             "scene": scene,
@@ -276,37 +272,28 @@ def _make_blocks(
     to: tuple[BlockStore, Path],
     by: tuple[Any, int],
 ) -> Path:
-    """Make the blocks that are missing, and the tiles that these need; the folder of the tiles.
+    """Make the tiles that are missing, and all blocks from them; the folder of the tiles.
 
     ``content``: digest of all that the disparities follow from but the ``offsets`` [n, m], px.
     ``to``: the store of the blocks, and the path of that of the tiles. ``by``: Dask's scheduler and
     its workers, which make one tile at a time if the method itself has several threads.
     """
     (blocks, out), (scheduler, workers) = to, by
-    tiling, places = job.tiling, list(job.tiling.places())
-    tile_keys = {p: digest({"content": content, "offset": int(offsets[p])}) for p in places}
-    keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
-    missing = blocks.missing([tiling.block_window(place) for place in places], keys, workers)
-    shape = tuple(n * tiling.side for n in tiling.count)
-    sizes = {"chunk": tiling.side, "shard": tiling.side}
-    with resumable_grid(out, shape, LAYERS, **sizes) as tiles:
-        wanted = sorted({p for k in missing for p in tiling.around(places[k])})
-        stored = [job._stored(p) for p in wanted]
-        todo = tiles.missing(stored, [tile_keys[p] for p in wanted], workers)
+    places = list(job.tiling.places())
+    keys = [digest({"content": content, "offset": int(offsets[place])}) for place in places]
+    side = job.tiling.side
+    shape = tuple(n * side for n in job.tiling.count)
+    with resumable_grid(out, shape, LAYERS, chunk=side, shard=side) as tiles:
+        missing = tiles.missing([job._stored(place) for place in places], keys, workers)
         _run(
             job.tile,
-            [(tiles, tile_keys[wanted[k]], wanted[k], int(offsets[wanted[k]])) for k in todo],
+            [(tiles, keys[k], places[k], int(offsets[places[k]])) for k in missing],
             f"tiles by {job.method}",
             scheduler,
             workers if job.threads == 1 else 1,
         )
-        _run(
-            job.block,
-            [(tiles, blocks, keys[k], places[k]) for k in missing],
-            "blending",
-            scheduler,
-            workers,
-        )
+        made = [(tiles, blocks, content, place) for place in places]
+        _run(job.block, made, "blending", scheduler, workers)
     return tiles.folder
 
 
