@@ -248,8 +248,11 @@ def maps(folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moved", [{}, {"polarity": "positive", "outside": "invalid"}])
-@pytest.mark.parametrize("settings", [EACH, FILE], ids=["each", "file"])
+@pytest.mark.parametrize(
+    ("settings", "moved"),
+    [(EACH, {}), (FILE, {"polarity": "positive", "outside": "invalid"})],
+    ids=["each", "file, moved"],
+)
 def test_a_program_around_sgm_gives_the_bytes_of_sgm(dataset, settings, moved):
     Path("infer.py").write_text(SGM)
     run(dataset, {"kind": "sgm", **moved}, "sgm")

@@ -23,6 +23,7 @@ from stereocities.world import surfaces_of
 from ...synthetic.small_cities import ROOT, read_points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("city", CITIES.values(), ids=list(CITIES))
 def test_committed_gcps_and_what_each_city_must_have(city: CitySpec) -> None:
     surfaces = surfaces_of(city)

@@ -60,6 +60,7 @@ def test_a_camera_sees_as_its_rpcs_do(texts):
     np.testing.assert_allclose(by_gdal(rpc, frame.to_geodetic(xyz)), image, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_twin_by_given_rpcs_shows_its_place(texts, tmp_path):
     file = place.write_place(tmp_path / "house.laz")
     city = twin_city("House", file, rpcs=texts)

@@ -120,6 +120,7 @@ def test_the_lidar_of_a_twin_lies_on_it(house, tmp_path):
     assert off.std() == pytest.approx(0.03, abs=0.015) and abs(off.mean()) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "days", "reason", "changed"),
     [
