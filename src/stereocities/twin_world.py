@@ -28,7 +28,6 @@ from .twin_surfaces import (
     OBJECT_M,
     STEP_M,
     Crowns,
-    Planes,
     Points,
     buildings_of,
     crowns_of,
@@ -184,7 +183,11 @@ def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, Crowns]:
     low = np.flatnonzero(low)
     low = low[thinned(points.xyz[low], GROUND_M)]
     found = planes_of(points.xyz[roofs])
-    tint = _tints(points, found, roofs, low, rng)
+    if points.tint is not None:
+        tint = points.tint[roofs], points.tint[low]
+    else:  # drawn for each roof, and the ground (0) has no paint
+        drawn = np.append(rng.uniform(*ROOF_LIGHT, len(found.plane)), 0.0)
+        tint = drawn[found.number], np.zeros(len(low))
     first = np.floor((points.xyz[:, :2].min(axis=0) - box[:2]) / CELL_M).astype(int)
     last = np.floor((points.xyz[:, :2].max(axis=0) - box[:2]) / CELL_M).astype(int) + 1
     raster = rasterised(
@@ -203,19 +206,6 @@ def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, Crowns]:
         patch_j=int(first[1]), paint=np.rint(raster.paint * PAINT).astype(np.uint16),
     )  # fmt: skip
     return s, crowns
-
-
-def _tints(
-    points: Points, found: Planes, roofs: np.ndarray, low: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Reflectance of the points on roofs and on the ground.
-
-    Where the file tells none, it is drawn for each roof, and the ground (0) has no paint.
-    """
-    if points.tint is not None:
-        return points.tint[roofs], points.tint[low]
-    drawn = np.append(rng.uniform(*ROOF_LIGHT, len(found.plane)), 0.0)
-    return drawn[found.number], np.zeros(len(low))
 
 
 MARGIN_PX = 30  # of the left image around the points
@@ -284,7 +274,11 @@ def twin_city(
             None if rpcs is None else tuple(str(read_rpc(file).file) for file in rpcs),
         ),
     )
-    cols, rows = size_px or _all_of_it(city, scene, right, up)
+    cols, rows = size_px or (
+        math.ceil(2 * (abs(float(axis @ right)) + abs(float(axis @ up))) / LEFT_GSD_M)
+        + 2 * MARGIN_PX
+        for axis in image_axes(city, scene)
+    )
     if max(cols, rows) > MOST_PX:
         raise InputError(
             f"would be {cols} x {rows} px of {LEFT_GSD_M} m, and {MOST_PX} are the most",
@@ -292,14 +286,3 @@ def twin_city(
             remedy="give a part of it about its middle, as --size 2000 2000, or cut the file",
         )
     return replace(city, scenes=(replace(scene, cols=cols, rows=rows),))
-
-
-def _all_of_it(
-    city: CitySpec, scene: SceneSpec, right: np.ndarray, up: np.ndarray
-) -> tuple[int, int]:
-    """Columns and rows of a left image that shows all points; half axes ``right``, ``up`` [2]."""
-    sides = []
-    for axis in image_axes(city, scene):
-        reach = abs(float(axis @ right)) + abs(float(axis @ up))
-        sides.append(math.ceil(2 * reach / LEFT_GSD_M) + 2 * MARGIN_PX)
-    return sides[0], sides[1]

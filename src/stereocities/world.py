@@ -114,35 +114,22 @@ def top_surface(
 log = logging.getLogger("stereotruth")
 
 
-@kernel
-def _list_cells(half_x, half_y, xy, x0, y0, ny, nx, first, out, fill):
-    """Count (fill False) or list the cells that objects' bounding rectangles touch."""
-    for n in range(xy.shape[0]):
-        i0 = max(int((xy[n, 0] - half_x[n] - x0) / CELL_M), 0)
-        i1 = min(int((xy[n, 0] + half_x[n] - x0) / CELL_M), nx - 1)
-        j0 = max(int((xy[n, 1] - half_y[n] - y0) / CELL_M), 0)
-        j1 = min(int((xy[n, 1] + half_y[n] - y0) / CELL_M), ny - 1)
-        for j in range(j0, j1 + 1):
-            for i in range(i0, i1 + 1):
-                cell = j * nx + i
-                if fill:
-                    out[first[cell]] = n
-                    first[cell] += 1
-                else:
-                    first[cell + 1] += 1
-
-
 def _cells(half: np.ndarray, xy: np.ndarray, s: Surfaces) -> tuple[np.ndarray, np.ndarray]:
+    """Objects by the cells that their bounding rectangles touch, as Surfaces has them.
+
+    ``half`` [n, 2]: half sides of the rectangles; ``xy`` [n, 2]: their middles.
+    """
     ny, nx = s.cell_top.shape
-    first = np.zeros(ny * nx + 1, np.int64)
-    half = np.ascontiguousarray(half + 0.01)
-    xy = np.ascontiguousarray(xy)
-    args = (half[:, 0].copy(), half[:, 1].copy(), xy, s.x0, s.y0, ny, nx)
-    _list_cells(*args, first, np.empty(0, np.int32), False)
-    first = np.cumsum(first)
-    listed = np.empty(first[-1], np.int32)
-    _list_cells(*args, first.copy(), listed, True)
-    return first, listed
+    low, high = ((xy + side * (half + 0.01) - [s.x0, s.y0]) / CELL_M for side in (-1, 1))
+    start = np.maximum(low.astype(np.int64), 0)
+    end = np.minimum(high.astype(np.int64), [nx - 1, ny - 1])
+    wide, tall = np.maximum(end - start + 1, 0).T
+    which = np.repeat(np.arange(len(xy)), wide * tall)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(wide * tall) - wide * tall, wide * tall)
+    column, row = start[which, 0] + number % wide[which], start[which, 1] + number // wide[which]
+    cell = row * nx + column
+    first = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=ny * nx))])
+    return first, which[np.argsort(cell, kind="stable")].astype(np.int32)
 
 
 def build_surfaces(city: CitySpec) -> Surfaces:
