@@ -28,8 +28,8 @@ from rasterio.transform import from_origin
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import distance_transform_edt, map_coordinates, minimum_filter
 
-from stereocities.__main__ import SEED, make_scene
 from stereocities.cities import CITIES, CitySpec
+from stereocities.sites import make_scene
 from stereocities.surfaces import ROOF, WATER
 from stereocities.truth import truth_at
 from stereotruth.align.aligned_pair import Alignment
@@ -286,7 +286,7 @@ def main() -> None:
     folder.mkdir(parents=True)
     city = small_city(given.city, given.size)
     scene = city.scenes[0].name
-    make_scene(city, city.scenes[0], folder / "in", spacing_m=0.4, seed=SEED)
+    make_scene(city, city.scenes[0], folder / "in", spacing_m=0.4, seed=1)
     rows = {"this project": make_ours(folder, city, given.cores)}
     made = folder / "results"
     store = PointStore(next((made / "ingest" / city.name / scene).glob("*.points")))

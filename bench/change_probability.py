@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from planted_changes import GROUND, KINDS, ROOF, Planted, RealScene
 from real import Pair, Site
 
-from stereocities.changes import REASONS, TEXTURE
+from stereocities.truth import REASONS, TEXTURE
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.status import is_labelled
 from stereotruth.epipolar.image_noise import EQUAL

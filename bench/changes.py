@@ -22,11 +22,11 @@ from drawn_scenes import Place, add_place, place_given
 from numpy.typing import NDArray
 from synthetic_pairs import VIEWS, change_images, fly, gain, noise, rectify_by
 
-from stereocities.changes import REASONS, changes_at
 from stereocities.cities import Canopy, CitySpec, Dates, ViewSpec, training_city
 from stereocities.control_points import simulate_points
 from stereocities.render import simulate_image
 from stereocities.surfaces import TREE, WATER
+from stereocities.truth import REASONS, changes_at
 from stereotruth.align.align import align
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.files import atomic_folder

@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from synthetic_pairs import SEED, VIEWS, fly, label_by
 
-from stereocities.__main__ import make_scene
 from stereocities.cities import CitySpec, FlightStrip, Jitter, SceneSpec, ViewSpec, training_city
 from stereocities.control_points import simulate_points
 from stereocities.render import simulate_image
+from stereocities.sites import make_scene
 from stereotruth.align.align import align
 from stereotruth.align.refine import refine
 from stereotruth.core.config.configuration import LabelSettings

@@ -23,8 +23,7 @@ from synthetic_pairs import fly
 
 from stereobench.methods.sgm import SemiGlobalMatcher
 from stereocities.rpcs import draw_bias
-from stereocities.site_images import pair_truth, simulate_site_image
-from stereocities.sites import SiteSpec, drawn_site
+from stereocities.sites import SiteSpec, drawn_site, pair_truth, simulate_site_image
 from stereotruth.core.products.grids import open_grid
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rectify import rectify

@@ -24,13 +24,14 @@ import numpy as np
 from figures import print_table
 from synthetic_pairs import VIEWS, far_apart, fly, rectify_by
 
-from stereocities.site_images import (
+from stereocities.sites import (
+    SiteSpec,
+    drawn_site,
     image_truth,
     pair_truth,
     simulate_site_image,
     simulate_site_points,
 )
-from stereocities.sites import SiteSpec, drawn_site
 from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align, from_rpcs
 from stereotruth.align.aligned_pair import Alignment

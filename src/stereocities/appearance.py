@@ -12,8 +12,17 @@ import numpy as np
 
 from stereotruth.core.kernels import inlined
 
-from .patches import PATCH_M, PATCHES_A_CELL
-from .surfaces import CELL_M, FIRST_PATCH, GROUND, ROOF, TREE, WATER, in_shadow
+from .surfaces import (
+    CELL_M,
+    FIRST_PATCH,
+    GROUND,
+    PATCH_M,
+    PATCHES_A_CELL,
+    ROOF,
+    TREE,
+    WATER,
+    in_shadow,
+)
 
 SKY = 0.34  # diffuse share of the light
 GROUND_MEAN = 0.2  # reflectance that the ground keeps whatever its contrast
@@ -72,16 +81,22 @@ def _is_resurfaced(s, i, j, along_q):
 
 
 @inlined
+def _in_block(s, n, x, y):
+    """A plan position along the axes of a zone, numbers of its block, distances to its edges."""
+    p = x * s.zones[n, 2] + y * s.zones[n, 3]
+    q = y * s.zones[n, 2] - x * s.zones[n, 3]
+    i, j = np.floor(p / s.zones[n, 4]), np.floor(q / s.zones[n, 5])
+    pe, qe = p - i * s.zones[n, 4], q - j * s.zones[n, 5]
+    return p, q, i, j, min(pe, s.zones[n, 4] - pe), min(qe, s.zones[n, 5] - qe)
+
+
+@inlined
 def resurfaced_at(s, x, y):
     """Whether the ground at a plan position is a street with the texture of a new surface."""
     n = zone_at(s, x, y)
     if s.zones[n, 7] >= 5:
         return False
-    p = x * s.zones[n, 2] + y * s.zones[n, 3]
-    q = y * s.zones[n, 2] - x * s.zones[n, 3]
-    i, j = np.floor(p / s.zones[n, 4]), np.floor(q / s.zones[n, 5])
-    pe, qe = p - i * s.zones[n, 4], q - j * s.zones[n, 5]
-    pe, qe = min(pe, s.zones[n, 4] - pe), min(qe, s.zones[n, 5] - qe)
+    _, _, i, j, pe, qe = _in_block(s, n, x, y)
     return min(pe, qe) < s.zones[n, 6] and _is_resurfaced(s, i, j, pe < qe)
 
 
@@ -96,11 +111,7 @@ def _ground(s, x, y, slope2):
     kind = int(s.zones[n, 7])
     if slope2 > 0.24 * 0.24 and kind != 8:
         kind = 7
-    p = x * s.zones[n, 2] + y * s.zones[n, 3]
-    q = y * s.zones[n, 2] - x * s.zones[n, 3]
-    i, j = np.floor(p / s.zones[n, 4]), np.floor(q / s.zones[n, 5])
-    pe, qe = p - i * s.zones[n, 4], q - j * s.zones[n, 5]
-    pe, qe = min(pe, s.zones[n, 4] - pe), min(qe, s.zones[n, 5] - qe)
+    p, q, i, j, pe, qe = _in_block(s, n, x, y)
     edge = min(pe, qe)
     chance = _hash(int(i), int(j), int(s.zones[n, 8] * 1e6))
     if kind < 5:

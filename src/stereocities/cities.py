@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -468,15 +467,8 @@ def _read(file: Path, changed_ns: int) -> CitySpec:
 
 def write_city(city: CitySpec, file: str | Path) -> None:
     """Write what a city has other than the defaults."""
+    from pydantic import TypeAdapter
+
+    values = TypeAdapter(CitySpec).dump_python(city, mode="json", exclude_defaults=True)
     with atomic_file(file) as scratch:
-        scratch.write_text(json.dumps(_plain(city), indent=2) + "\n", encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value):
-        return {
-            f.name: _plain(given)
-            for f in fields(value)
-            if (given := getattr(value, f.name)) != f.default or f.default is MISSING
-        }
-    return [_plain(one) for one in value] if isinstance(value, tuple) else value
+        scratch.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")

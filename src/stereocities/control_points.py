@@ -14,9 +14,18 @@ from stereotruth.core.products.files import write_table
 from .camera import project_point
 from .cities import CITIES, CitySpec, SceneSpec
 from .layout import scene_coordinates
-from .patches import NOTHING, PATCH_M, PATCHES_A_CELL
 from .render import Camera, ImagedScene, prepare
-from .surfaces import ANY_VIEW, IN_IMAGES, IN_LIDAR, Surfaces, cast, terrain_heights
+from .surfaces import (
+    ANY_VIEW,
+    IN_IMAGES,
+    IN_LIDAR,
+    NOTHING,
+    PATCH_M,
+    PATCHES_A_CELL,
+    Surfaces,
+    cast,
+    terrain_heights,
+)
 from .truth import seen_from
 
 log = logging.getLogger("stereotruth")
@@ -27,20 +36,21 @@ GCP_COUNT = 20
 CHECKPOINT_COUNT = 80
 GCP_NOISE_PX = 0.25
 FRAME_MARGIN_PX = 30.0
+CLEAR_M = 0.005  # below which nothing hides a point
 MARKS_M = 4.0  # between the places of a twin that can be measured
 
 
 @kernel
-def _see(s, shown, above, cam, cols, rows, xyz, tolerance, image, seen):
+def _see(view, xyz, image, seen):
     """Image coordinates (col, row) of points in one image, and whether it shows them."""
     line = np.empty(12)
     m = FRAME_MARGIN_PX
     for n in range(xyz.shape[0]):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
-        col, row = project_point(cam, x, y, z, 0.5 * rows, line)
-        free = seen_from(s, above, x, y, z, line, shown, tolerance)
+        col, row = project_point(view.cam, x, y, z, 0.5 * view.rows, line)
+        free = seen_from(view.surfaces, view.above, x, y, z, line, view.shown, CLEAR_M)
         image[n, 0], image[n, 1] = col, row
-        seen[n] = free and m < col < cols - m and m < row < rows - m
+        seen[n] = free and m < col < view.cols - m and m < row < view.rows - m
 
 
 def visible_in(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,10 +59,7 @@ def visible_in(camera: Camera, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     What lies within FRAME_MARGIN_PX of the frame does not count as shown.
     """
     image, seen = np.empty((len(xyz), 2)), np.zeros(len(xyz), bool)
-    _see(
-        camera.surfaces, camera.shown, camera.horizon, camera.cam, float(camera.cols),
-        float(camera.rows), np.ascontiguousarray(xyz), 0.005, image, seen,
-    )  # fmt: skip
+    _see(camera.sight, np.ascontiguousarray(xyz), image, seen)
     return image, seen
 
 
@@ -190,7 +197,7 @@ def _open(s, xyz, out):
         x, y, z = xyz[n, 0], xyz[n, 1], xyz[n, 2]
         a, kind_a, _, _, _, _, _ = cast(s, s.lidar_top, x, y, 0.0, 0.0, ANY_VIEW, True, z)
         b, kind_b, _, _, _, _, _ = cast(s, s.lidar_top, x, y, 0.0, 0.0, IN_LIDAR, True, z)
-        out[n] = kind_a != 0 and kind_b != 0 and a < z + 0.005 and b < z + 0.005
+        out[n] = kind_a != 0 and kind_b != 0 and a < z + CLEAR_M and b < z + CLEAR_M
 
 
 def _open_sky(s, xyz: np.ndarray) -> np.ndarray:

@@ -13,8 +13,8 @@ import logging
 import math
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import laspy
 import numpy as np
@@ -25,12 +25,11 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.kernels import inlined, kernel
 from stereotruth.core.products.files import atomic_file
 
-from .built_city import surfaces_of
+from .camera import LocalFrame
 from .cities import CitySpec, FlightStrip, SceneSpec, lidar_files, tile_index
-from .dated_worlds import world_of
-from .geodesy import LocalFrame
 from .layout import coverage, covered, frame_of
 from .surfaces import GROUND, IN_LIDAR, TREE, WATER, Surfaces, above_ground, terrain_at
+from .world import surfaces_of, world_of
 
 log = logging.getLogger("stereotruth")
 
@@ -263,7 +262,7 @@ def _pulses(
     Of a ``strip`` with its error, or of both crossed sets of flight lines.
     """
     directions = (0, 1) if strip is None else (0,)
-    lattice = spacing_m * math.sqrt(2) if strip is None else strip.spacing_m
+    lattice = spacing_m * math.sqrt(2) if strip is None else strip.strip.spacing_m
     per_line = int((box[2] - box[0]) / lattice) + 4
     lines = max(1, PULSES_A_CHUNK // per_line)
     xyz, info = np.empty((2 * per_line * lines, 3)), np.empty((2 * per_line * lines, 6), np.int32)
@@ -293,7 +292,7 @@ def simulate_lidar_tile(
 
     ``spacing_m``: aggregate pulse spacing, both sets of flight lines taken together.
     ``seed`` draws noise, jitter and which pulses pass a crown. ``built``: the
-    city's surfaces in a file, see :func:`.built_city.surfaces_of`. Returns the number of points by
+    city's surfaces in a file, see :func:`.world.surfaces_of`. Returns the number of points by
     class.
     Raises InputError for a tile that the scene has not, or a spacing out of 0.1 to 5 m.
     """
@@ -342,8 +341,7 @@ EDGE_OF_LINE = np.uint8(0x80)
 EDGE_PULSES = 3.0  # from a strip's end: lines that end earlier leave its ground, not the strip
 
 
-@dataclass(frozen=True)
-class FlownStrip:
+class FlownStrip(NamedTuple):
     """A strip over a scene: its ``number`` from 1 on, and its ``west`` and ``east`` end, m.
 
     ``south``, ``north``: where its line begins and ends.
@@ -355,11 +353,6 @@ class FlownStrip:
     east: float
     south: float
     north: float
-
-    @property
-    def spacing_m(self) -> float:
-        """Of its pulses."""
-        return self.strip.spacing_m
 
     def taken(self, xyz: np.ndarray, info: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Those of points [n, 3] that it measures, where it has them, and their ``info`` [n, 6]."""
@@ -377,8 +370,9 @@ class FlownStrip:
         if "gps_time" in fields.dtype.names:
             start = START_S + self.number * ((self.north - self.south) / SPEED_M_S + TURN_S)
             fields["gps_time"] = start + (xyz[:, 1] - self.south) / SPEED_M_S
-        new = np.diff(xyz[:, 1]) > self.spacing_m / 2
-        across, near = xyz[:, 0] - self.strip.offset_m[0], EDGE_PULSES * self.spacing_m
+        spacing_m = self.strip.spacing_m
+        new = np.diff(xyz[:, 1]) > spacing_m / 2
+        across, near = xyz[:, 0] - self.strip.offset_m[0], EDGE_PULSES * spacing_m
         edge = np.append(new, True) & (across > self.east - near)
         edge |= np.append(True, new) & (across < self.west + near)
         flags = "classification_flags" if header.point_format.id >= 6 else "bit_fields"
@@ -397,14 +391,8 @@ def flown_strips(city: CitySpec, scene: SceneSpec) -> list[FlownStrip]:
     ])  # fmt: skip
     low, high = corners.min(axis=0), corners.max(axis=0)
     step = (high[0] - low[0]) / (len(city.strips) - OVERLAP * (len(city.strips) - 1))
-    return [
-        FlownStrip(
-            strip,
-            number,
-            low[0] + (number - 1) * step * (1 - OVERLAP),
-            low[0] + (number - 1) * step * (1 - OVERLAP) + step,
-            low[1],
-            high[1],
-        )
-        for number, strip in enumerate(city.strips, 1)
-    ]
+    flown = []
+    for number, strip in enumerate(city.strips, 1):
+        west = low[0] + (number - 1) * step * (1 - OVERLAP)
+        flown.append(FlownStrip(strip, number, west, west + step, low[1], high[1]))
+    return flown

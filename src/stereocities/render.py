@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import rasterio
-from rasterio.rpc import RPC as RPCMetadata
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import progress
@@ -18,15 +17,11 @@ from stereotruth.core.kernels import inlined, kernel
 from stereotruth.core.products.files import atomic_file
 
 from .appearance import reflectance
-from .built_city import surfaces_of
-from .camera import Pass, aim, direction, jittering, pose, rays
+from .camera import LocalFrame, Pass, aim, direction, jittering, pose, rays
 from .cities import LEFT_GSD_M, RIGHT_GSD_M, CitySpec, SceneSpec, ViewSpec
-from .dated_worlds import world_of
-from .geodesy import LocalFrame
 from .layout import frame_of, half_size, scene_coordinates
 from .rpcs import FittedRPC, draw_bias, fit_rpc, read_rpc, rpc_camera
 from .surfaces import (
-    CLOSE_M,
     LEFT_VIEW,
     NONE,
     RIGHT_VIEW,
@@ -35,10 +30,9 @@ from .surfaces import (
     direction_of_sun,
     ground_hit,
     horizon,
-    spline,
-    spline_cell,
     terrain_heights,
 )
+from .world import surfaces_of, world_of
 
 log = logging.getLogger("stereotruth")
 
@@ -46,15 +40,14 @@ log = logging.getLogger("stereotruth")
 FULL_SCALE = 2047  # 11 bits
 FULL_SCALE_OF_8 = 255
 STRIP_ROWS = 128
-LANES, BLOCK = 8, 64  # rows of the half-pixel raster side by side, columns at a time
-# Of each lane: its ray, the ground, the last step, where in a cell of the spline, coefficients
-AX, AY, BX, BY, Z, ZX, ZY, STEP, F, G, SPLINE = (LANES * k for k in range(11))
+GUESS_ROWS = 8
 RPC_MARGIN_M = 130.0
 FRAME_PX = 30  # of a window of given RPCs around the place
 SHOWN = {"left": LEFT_VIEW, "right": RIGHT_VIEW}
 RADIOMETRY = {"left": (55.0, 1480.0), "right": (70.0, 1370.0)}  # dark value, DN per reflectance
 LEFT_COLLAR, RIGHT_COLLAR = 1, 2  # see in_collar
 COLLARS = {"left": LEFT_COLLAR, "right": RIGHT_COLLAR}
+View = tuple[str, np.ndarray, int, int]  # an image's name, packed camera, columns and rows
 NOISE_SEEDS = {"left": 1, "right": 0}
 
 
@@ -80,6 +73,25 @@ class Camera(NamedTuple):
     noise_seed: int
     look: ViewSpec = ViewSpec()
 
+    @property
+    def sight(self) -> Sight:
+        """What kernels need of it."""
+        return Sight(
+            self.surfaces, self.horizon, self.shown, self.cam, self.collar, self.cols, self.rows
+        )
+
+
+class Sight(NamedTuple):
+    """An image for kernels: its world, horizon (``above``), bits shown, camera, collar and size."""
+
+    surfaces: Surfaces
+    above: np.ndarray
+    shown: int
+    cam: np.ndarray
+    collar: int
+    cols: int
+    rows: int
+
 
 class Relief(NamedTuple):
     """Heights of a scene, m above the frame's: lowest ground, middle of the ground, highest top."""
@@ -103,7 +115,7 @@ class ImagedScene(NamedTuple):
 def prepare(city: CitySpec, scene: SceneSpec, built: str | Path | None = None) -> ImagedScene:
     """World and cameras of a scene; kept for further calls of the same process.
 
-    ``built``: the city's surfaces in a file, see :func:`.built_city.surfaces_of`.
+    ``built``: the city's surfaces in a file, see :func:`.world.surfaces_of`.
     """
     return _prepare(city, scene, None if built is None else Path(built))
 
@@ -131,15 +143,6 @@ def _prepare(city: CitySpec, scene: SceneSpec, built: Path | None) -> ImagedScen
     return ImagedScene(city, scene, frame, surfaces, *cameras)
 
 
-class View(NamedTuple):
-    """One of two images: its name, packed camera, columns and rows."""
-
-    name: str
-    cam: np.ndarray
-    cols: int
-    rows: int
-
-
 def _on_a_pass(scene: SceneSpec, frame: LocalFrame, relief: Relief) -> list[View]:
     """Both images of a scene as GaoFen-7 takes them on one pass."""
     target = np.array([*scene.centre_m, relief.middle])
@@ -157,7 +160,7 @@ def _on_a_pass(scene: SceneSpec, frame: LocalFrame, relief: Relief) -> list[View
     ):
         flown = Pass.drawn(view, scene.pose_seed, ascending=scene.ascending)
         cam = aim(frame, target, flown, gsd=gsd, cols=cols, rows=rows)
-        views.append(View(view, cam, cols, rows))
+        views.append((view, cam, cols, rows))
     return views
 
 
@@ -178,7 +181,7 @@ def _by_rpcs(city: CitySpec, frame: LocalFrame, relief: Relief) -> list[View]:
         first = np.floor(image.min(axis=0)).astype(int) - FRAME_PX
         cols, rows = (np.ceil(image.max(axis=0)).astype(int) + FRAME_PX - first).tolist()
         cam = rpc_camera(rpc.cropped(*first.tolist()), frame, (cols, rows), heights)
-        views.append(View(view, cam, cols, rows))
+        views.append((view, cam, cols, rows))
     return views
 
 
@@ -252,66 +255,23 @@ def in_collar(collar, col, row, cols, rows):
     RIGHT_COLLAR: along the last rows and first columns.
     """
     if collar == LEFT_COLLAR:
-        return row < 3 + 14 * col / cols or col > cols - 4 - 9 * row / rows
-    return row > rows - 5 - 12 * col / cols or col < 3 + 10 * row / rows
+        return (row < 3 + 14 * col / cols) | (col > cols - 4 - 9 * row / rows)
+    return (row > rows - 5 - 12 * col / cols) | (col < 3 + 10 * row / rows)
 
 
 @inlined
-def _ray(cam, line, col):
+def has_data(image, col, row):
+    """Whether a position lies in the frame of an image, outside its collar."""
+    inside = col >= -0.5 and row >= -0.5 and col <= image.cols - 0.5 and row <= image.rows - 0.5
+    return inside and not in_collar(image.collar, col, row, image.cols, image.rows)
+
+
+@inlined
+def ray(cam, line, col):
     """(ax, ay, bx, by) of the ray of a column of a line."""
     dx, dy, dz = direction(cam, line, col)
     bx, by = dx / dz, dy / dz
     return line[0] - bx * line[2], line[1] - by * line[2], bx, by
-
-
-@inlined
-def _lane(work, at):
-    """Four values of one lane, the first of which lies there."""
-    return work[at], work[at + LANES], work[at + 2 * LANES], work[at + 3 * LANES]
-
-
-@inlined
-def _ground_below(s, cam, lines, col, first, ground, before, work):
-    """Rays of a column of all lanes and the ground that they meet, in ``work``.
-
-    ``ground``, ``before`` [LANES]: z of the ground a column and two before, moved on by one; there
-    is none before the ``first`` column. The loop in the middle neither branches nor looks anything
-    up, so that the processor takes all lanes at a time.
-    """
-    c = s.terrain
-    for k in range(LANES):
-        ax, ay, bx, by = _ray(cam, lines[k], col)
-        z = ground[k]
-        if not first:  # the ground goes on as it did
-            z += ground[k] - before[k]
-        before[k] = ground[k]
-        i, j, f, g = spline_cell(s, ax + bx * z, ay + by * z)
-        work[AX + k], work[AY + k], work[BX + k], work[BY + k], work[Z + k] = ax, ay, bx, by, z
-        work[F + k], work[G + k] = f, g
-        for m in range(4):
-            for n in range(4):
-                at = SPLINE + (4 * m + n) * LANES + k
-                work[at] = c[np.uint64(j - 1 + m), np.uint64(i - 1 + n)]
-    for k in range(LANES):
-        at = SPLINE + k
-        z, zx, zy = spline(
-            s,
-            work[F + k],
-            work[G + k],
-            _lane(work, at),
-            _lane(work, at + 4 * LANES),
-            _lane(work, at + 8 * LANES),
-            _lane(work, at + 12 * LANES),
-        )
-        step = (z - work[Z + k]) / (1 - zx * work[BX + k] - zy * work[BY + k])
-        work[ZX + k], work[ZY + k], work[STEP + k] = zx, zy, step
-        work[Z + k] += step
-    for k in range(LANES):
-        if abs(work[STEP + k]) >= CLOSE_M:  # rarely
-            work[Z + k], work[ZX + k], work[ZY + k] = ground_hit(
-                s, work[AX + k], work[AY + k], work[BX + k], work[BY + k], work[Z + k]
-            )
-        ground[k] = work[Z + k]
 
 
 @kernel
@@ -319,39 +279,29 @@ def _shade_rows(s, above, shown, cam, first_row, out):
     """Reflectance on the half-pixel raster: out[2 r + a, 2 c + b] at (c, r) − 1/4 + (b, a)/2.
 
     ``shown``: bits of the objects seen. ``first_row`` is the image row of out's row 0; out's column
-    0 is image column −2. Where the ground is follows from where it was a column before. Several
-    rows go side by side, so that the processor need not wait for one to end before it begins with
-    another.
+    0 is image column −2. Where the ground is follows from where it was a column before; at the
+    first column, from where it was at the end of the row GUESS_ROWS before.
     """
-    lines = np.empty((LANES, 12))
-    ground, before = np.zeros(LANES), np.zeros(LANES)
-    work = np.empty(SPLINE + 16 * LANES)
-    hits = np.empty((LANES, BLOCK, 7))
+    line = np.empty(12)
+    last = np.zeros(GUESS_ROWS)
     sun = s.sun[0], s.sun[1], s.sun[2]
-    for r0 in range(0, out.shape[0], LANES):
-        lanes = min(LANES, out.shape[0] - r0)
-        for k in range(LANES):
-            pose(cam, first_row - 0.25 + 0.5 * (r0 + k), lines[k])
-        for c0 in range(0, out.shape[1], BLOCK):
-            columns = min(BLOCK, out.shape[1] - c0)
-            for n in range(columns):
-                col = -2.25 + 0.5 * (c0 + n)
-                _ground_below(s, cam, lines, col, c0 + n == 0, ground, before, work)
-                for k in range(LANES):
-                    for m in range(7):
-                        hits[k, n, m] = work[m * LANES + k]
-            for k in range(lanes):
-                for n in range(columns):
-                    ax, ay, bx, by, ground_z, zx, zy = hits[k, n]
-                    z, kind, index, face = above_ground(
-                        s, above, ax, ay, bx, by, shown, True, ground_z
-                    )
-                    value = 0.1
-                    if kind != NONE:
-                        value = reflectance(
-                            s, sun, shown, ax + bx * z, ay + by * z, z, kind, index, face, (zx, zy)
-                        )
-                    out[r0 + k, c0 + n] = value
+    for r in range(out.shape[0]):
+        pose(cam, first_row - 0.25 + 0.5 * r, line)
+        ground = last[r % GUESS_ROWS]
+        before = ground
+        for c in range(out.shape[1]):
+            ax, ay, bx, by = ray(cam, line, -2.25 + 0.5 * c)
+            guess = ground + (ground - before)  # the ground goes on as it did
+            before = ground
+            ground, zx, zy = ground_hit(s, ax, ay, bx, by, guess)
+            z, kind, index, face = above_ground(s, above, ax, ay, bx, by, shown, True, ground)
+            value = 0.1
+            if kind != NONE:
+                value = reflectance(
+                    s, sun, shown, ax + bx * z, ay + by * z, z, kind, index, face, (zx, zy)
+                )
+            out[r, c] = value
+        last[r % GUESS_ROWS] = ground
 
 
 def _decimate(half: np.ndarray, psf_px: float) -> np.ndarray:
@@ -365,19 +315,6 @@ def _decimate(half: np.ndarray, psf_px: float) -> np.ndarray:
     across = sum(w * half[:, start + k : start + k + 2 * size : 2] for k, w in enumerate(weights))
     size = half.shape[0] // 2 - 4
     return sum(w * across[start + k : start + k + 2 * size : 2] for k, w in enumerate(weights))
-
-
-def _rpc_metadata(rpc: FittedRPC) -> RPCMetadata:
-    line_off, samp_off, lat_off, lon_off, h_off, line_s, samp_s, lat_s, lon_s, h_s = map(
-        float, rpc.numbers
-    )
-    line_num, line_den, samp_num, samp_den = (c.tolist() for c in rpc.coefficients)
-    return RPCMetadata(
-        height_off=h_off, height_scale=h_s, lat_off=lat_off, lat_scale=lat_s,
-        line_den_coeff=line_den, line_num_coeff=line_num, line_off=line_off, line_scale=line_s,
-        long_off=lon_off, long_scale=lon_s, samp_den_coeff=samp_den, samp_num_coeff=samp_num,
-        samp_off=samp_off, samp_scale=samp_s, err_bias=12.0, err_rand=0.5,
-    )  # fmt: skip
 
 
 def simulate_image(
@@ -417,7 +354,7 @@ def render(camera: Camera, name: str, out_tif: str | Path, *, seed: int) -> dict
     profile = dict(
         driver="GTiff", width=cols, height=rows, count=1, dtype="uint16", nodata=0, tiled=True,
         blockxsize=256, blockysize=256, compress="deflate", predictor=2, zlevel=1,
-        rpcs=_rpc_metadata(camera.rpc),
+        rpcs=camera.rpc.metadata,
     )  # fmt: skip
     col_index = np.arange(cols, dtype=np.float64)[None, :]
     strips = range(0, rows, STRIP_ROWS)
@@ -436,17 +373,10 @@ def render(camera: Camera, name: str, out_tif: str | Path, *, seed: int) -> dict
             signal += noise * np.sqrt(4.0 + 0.035 * signal)
             values = np.clip(np.rint(signal * scale), 1, full_scale).astype(np.uint16)
             row = np.arange(first, first + count, dtype=np.float64)[:, None]
-            values[_collar(camera.collar, col_index, row, cols, rows)] = 0
+            values[in_collar(camera.collar, col_index, row, cols, rows)] = 0
             image[first : first + count] = values
         with rasterio.open(scratch, "w", **profile) as target:
             target.write(image, 1)
             bits = full_scale.bit_length()
             target.set_band_description(1, f"panchromatic, {bits} bits")
     return {"cols": cols, "rows": rows, "rpc_rms_px": camera.rpc.rms_px}
-
-
-def _collar(collar: int, col: np.ndarray, row: np.ndarray, cols: int, rows: int) -> np.ndarray:
-    """Vectorised :func:`in_collar`."""
-    if collar == LEFT_COLLAR:
-        return (row < 3 + 14 * col / cols) | (col > cols - 4 - 9 * row / rows)
-    return (row > rows - 5 - 12 * col / cols) | (col < 3 + 10 * row / rows)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from rasterio.rpc import RPC as RPCMetadata
 
 from stereotruth.core.errors import InputError
 
@@ -30,25 +31,81 @@ from .camera import (
     STATION_X,
     STATION_Y,
     STATION_Z,
+    LocalFrame,
     locate,
 )
-from .geodesy import LocalFrame
+
+NUMBERS = ("line_off", "samp_off", "lat_off", "long_off", "height_off", "line_scale", "samp_scale",
+           "lat_scale", "long_scale", "height_scale")  # fmt: skip
+RATIOS = "line_num_coeff", "line_den_coeff", "samp_num_coeff", "samp_den_coeff"
 
 
 @dataclass(frozen=True)
-class FittedRPC:
-    """RPC00B metadata; ``bias`` float64[2, 3] maps true (col, row, 1) to what the RPCs predict.
+class RPC:
+    """RPC00B: ``numbers`` in the order of NUMBERS, ``coefficients`` float64[4, 20] of RATIOS."""
 
-    ``numbers``: line_off, samp_off, lat_off, long_off, height_off and the five scales in that
-    order. ``coefficients`` float64[4, 20]: line_num, line_den, samp_num, samp_den. Residuals in
-    px, on points that did not make the fit.
+    numbers: np.ndarray
+    coefficients: np.ndarray
+
+    @property
+    def metadata(self) -> RPCMetadata:
+        """As images carry them."""
+        values = dict(zip(NUMBERS, map(float, self.numbers)))
+        values |= dict(zip(RATIOS, self.coefficients.tolist()))
+        return RPCMetadata(**values, err_bias=12.0, err_rand=0.5)
+
+    def project(self, lonlath: np.ndarray) -> np.ndarray:
+        """Image coordinates [n, 2] (col, row) of longitude, latitude, height [n, 3]."""
+        line_off, samp_off, lat_off, lon_off, h_off, line_s, samp_s, lat_s, lon_s, h_s = (
+            self.numbers
+        )
+        a = terms(
+            (lonlath[:, 0] - lon_off) / lon_s,
+            (lonlath[:, 1] - lat_off) / lat_s,
+            (lonlath[:, 2] - h_off) / h_s,
+        )
+        line_num, line_den, samp_num, samp_den = (a @ c for c in self.coefficients)
+        return np.column_stack([
+            samp_num / samp_den * samp_s + samp_off, line_num / line_den * line_s + line_off
+        ])  # fmt: skip
+
+    def over(self, lon: float, lat: float, height: float) -> RPC:
+        """These RPCs, or, if they are of another place, the same moved over this one.
+
+        Longitudes are stretched as the meridians draw together, so that metres stay metres.
+        """
+        _, _, lat_off, lon_off, h_off, _, _, lat_s, lon_s, h_s = self.numbers
+        off = (lon - lon_off) / lon_s, (lat - lat_off) / lat_s, (height - h_off) / h_s
+        if max(map(abs, off)) <= 1.0:
+            return self
+        numbers = self.numbers.copy()
+        numbers[2:5] = lat, lon, height
+        numbers[8] *= np.cos(np.radians(lat_off)) / np.cos(np.radians(lat))
+        return replace(self, numbers=numbers)
+
+    def cropped(self, col: int, row: int) -> RPC:
+        """The RPCs of the image from a column and a row on."""
+        numbers = self.numbers.copy()
+        numbers[:2] -= row, col
+        return replace(self, numbers=numbers)
+
+
+@dataclass(frozen=True)
+class FittedRPC(RPC):
+    """``bias`` float64[2, 3] maps true (col, row, 1) to what the RPCs predict.
+
+    ``rms_px``: of the residuals, on points that did not make the fit.
     """
 
-    numbers: tuple[float, ...]
-    coefficients: np.ndarray
     bias: np.ndarray
     rms_px: float
-    max_px: float
+
+
+@dataclass(frozen=True)
+class GivenRPC(RPC):
+    """RPCs of a ``file``."""
+
+    file: Path
 
 
 def terms(lon: np.ndarray, lat: np.ndarray, height: np.ndarray) -> np.ndarray:
@@ -135,68 +192,14 @@ def fit_rpc(
     a = design(ground)
     found = np.column_stack([(a @ num) / (a @ den) for num, den in (samp, line)]) * scale + offset
     miss = found - (true @ bias[:, :2].T + bias[:, 2])
-    return FittedRPC(
-        (offset[1], offset[0], lat_off, lon_off, h_off,
-         scale[1], scale[0], lat_scale, lon_scale, h_scale),
-        np.stack([*line, *samp]),
-        bias,
-        float(np.sqrt((miss**2).sum(axis=1).mean())),
-        float(np.abs(miss).max()),
-    )  # fmt: skip
+    numbers = np.array([offset[1], offset[0], lat_off, lon_off, h_off,
+                        scale[1], scale[0], lat_scale, lon_scale, h_scale])  # fmt: skip
+    rms_px = float(np.sqrt((miss**2).sum(axis=1).mean()))
+    return FittedRPC(numbers, np.stack([*line, *samp]), bias, rms_px)
 
 
 STATIONS_M = 2e5, 4e7  # heights of satellites
 MISFIT_PX = 0.02
-NAMES = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF", "LINE_SCALE", "SAMP_SCALE",
-         "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")  # fmt: skip
-RATIOS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
-
-
-@dataclass(frozen=True)
-class GivenRPC:
-    """RPCs of a ``file``.
-
-    ``numbers`` in the order of NAMES, ``coefficients`` float64[4, 20] in that of RATIOS.
-    """
-
-    file: Path
-    numbers: np.ndarray
-    coefficients: np.ndarray
-
-    def project(self, lonlath: np.ndarray) -> np.ndarray:
-        """Image coordinates [n, 2] (col, row) of longitude, latitude, height [n, 3]."""
-        line_off, samp_off, lat_off, lon_off, h_off, line_s, samp_s, lat_s, lon_s, h_s = (
-            self.numbers
-        )
-        a = terms(
-            (lonlath[:, 0] - lon_off) / lon_s,
-            (lonlath[:, 1] - lat_off) / lat_s,
-            (lonlath[:, 2] - h_off) / h_s,
-        )
-        line_num, line_den, samp_num, samp_den = (a @ c for c in self.coefficients)
-        return np.column_stack([
-            samp_num / samp_den * samp_s + samp_off, line_num / line_den * line_s + line_off
-        ])  # fmt: skip
-
-    def over(self, lon: float, lat: float, height: float) -> GivenRPC:
-        """These RPCs, or, if they are of another place, the same moved over this one.
-
-        Longitudes are stretched as the meridians draw together, so that metres stay metres.
-        """
-        _, _, lat_off, lon_off, h_off, _, _, lat_s, lon_s, h_s = self.numbers
-        off = (lon - lon_off) / lon_s, (lat - lat_off) / lat_s, (height - h_off) / h_s
-        if max(map(abs, off)) <= 1.0:
-            return self
-        numbers = self.numbers.copy()
-        numbers[2:5] = lat, lon, height
-        numbers[8] *= np.cos(np.radians(lat_off)) / np.cos(np.radians(lat))
-        return replace(self, numbers=numbers)
-
-    def cropped(self, col: int, row: int) -> GivenRPC:
-        """The RPCs of the image from a column and a row on."""
-        numbers = self.numbers.copy()
-        numbers[:2] -= row, col
-        return replace(self, numbers=numbers)
 
 
 def read_rpc(file: str | Path) -> GivenRPC:
@@ -208,7 +211,7 @@ def read_rpc(file: str | Path) -> GivenRPC:
     if not file.is_file():
         raise InputError("there is no such file", file=file, remedy="name images with RPCs")
     try:
-        return GivenRPC(file, *_of_text(file.read_text(encoding="ascii")))
+        return GivenRPC(*_of_text(file.read_text(encoding="ascii")), file)
     except (UnicodeDecodeError, KeyError, ValueError):
         pass
     try:
@@ -222,17 +225,10 @@ def read_rpc(file: str | Path) -> GivenRPC:
         raise InputError(
             "has no RPCs", file=file, remedy="name images with RPCs, or texts of RPCs (_RPC.TXT)"
         )
-    return GivenRPC(
-        file,
-        np.array([
-            given.line_off, given.samp_off, given.lat_off, given.long_off, given.height_off,
-            given.line_scale, given.samp_scale, given.lat_scale, given.long_scale,
-            given.height_scale,
-        ]),
-        np.array([
-            given.line_num_coeff, given.line_den_coeff, given.samp_num_coeff, given.samp_den_coeff
-        ]),
-    )  # fmt: skip
+    numbers, ratios = (
+        np.array([getattr(given, name) for name in names]) for names in (NUMBERS, RATIOS)
+    )
+    return GivenRPC(numbers, ratios, file)
 
 
 def _of_text(text: str) -> tuple[np.ndarray, np.ndarray]:
@@ -241,8 +237,8 @@ def _of_text(text: str) -> tuple[np.ndarray, np.ndarray]:
     for line in text.splitlines():
         key, _, value = line.partition(":")
         if value.strip():
-            found[key.strip()] = float(value.split()[0])
-    numbers = np.array([found[name] for name in NAMES])
+            found[key.strip().lower()] = float(value.split()[0])
+    numbers = np.array([found[name] for name in NUMBERS])
     ratios = [[found[f"{name}_{k}"] for k in range(1, 21)] for name in RATIOS]
     return numbers, np.array(ratios)
 

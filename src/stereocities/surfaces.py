@@ -1,11 +1,14 @@
 """Exact ray casting on the surfaces of a synthetic city.
 
 Ground is a bicubic B-spline of z over (x, y), cut by a level water plane. Buildings are rotated
-rectangles with vertical walls and a flat or gabled roof, closed below; trees are ellipsoids. Rays
-are lines x = ax + bx z, y = ay + by z, given by (ax, ay, bx, by), and all of them come from above
-everything: the surface that is hit is the one of greatest z. The cell lists only say which objects
-a ray may meet; the intersections are those of the surfaces themselves. Twins of real places have
-roofs of planar patches (:mod:`.patches`) in the place of buildings.
+rectangles with vertical walls and a flat or gabled roof, closed below; trees are ellipsoids. Twins
+of real places have a raster of planar patches in the place of buildings: a patch is a square of
+PATCH_M of the plan, solid from the ground up to a plane of its own. Patches of one plane make one
+roof without a seam; between others stand vertical steps.
+
+Rays are lines x = ax + bx z, y = ay + by z, given by (ax, ay, bx, by), and all of them come from
+above everything: the surface that is hit is the one of greatest z. The cell lists only say which
+objects a ray may meet; the intersections are those of the surfaces themselves.
 """
 
 from __future__ import annotations
@@ -17,7 +20,67 @@ import numpy as np
 
 from stereotruth.core.kernels import inlined, kernel
 
-from .patches import PATCH_M, patch_top
+PATCH_M = 0.25
+PATCHES_A_CELL = 32  # of surfaces.CELL_M, along each side
+NOTHING = -1e9  # z where no patch stands
+STEP_M = 0.05  # what a ray enters deeper below a patch's top than this is its side
+
+
+@inlined
+def patch_top(s, i, j, ax, ay, bx, by, low, high):
+    """z where a ray from above first meets a patch of cell (i, j) between two heights, −1e30:
+    nowhere; number of the patch in the raster; whether its side is met.
+
+    ``low``, ``high``: z where the ray enters and leaves the cell, from below.
+    """
+    top, number, is_side = -1e30, -1, False
+    rows, cols = s.patches.shape[0], s.patches.shape[1]
+    first_i, first_j = PATCHES_A_CELL * (i - s.patch_i), PATCHES_A_CELL * (j - s.patch_j)
+    if first_i < 0 or first_j < 0 or first_i >= cols or first_j >= rows:
+        return top, number, is_side
+    last_i, last_j = first_i + PATCHES_A_CELL - 1, first_j + PATCHES_A_CELL - 1
+    x0 = s.x0 + PATCHES_A_CELL * PATCH_M * s.patch_i
+    y0 = s.y0 + PATCHES_A_CELL * PATCH_M * s.patch_j
+    m = min(max(int((ax + bx * low - x0) / PATCH_M), first_i), last_i)
+    n = min(max(int((ay + by * low - y0) / PATCH_M), first_j), last_j)
+    step_m, step_n = 1 if bx > 0 else -1, 1 if by > 0 else -1
+    next_x = next_y = per_x = per_y = 1e30
+    if abs(bx) > 1e-9:
+        next_x, per_x = (x0 + PATCH_M * (m + (bx > 0)) - ax) / bx, PATCH_M / abs(bx)
+    if abs(by) > 1e-9:
+        next_y, per_y = (y0 + PATCH_M * (n + (by > 0)) - ay) / by, PATCH_M / abs(by)
+    z = low
+    while z < high:
+        leaves = min(next_x, next_y, high)
+        middle = s.patches[n, m, 0]
+        if middle > NOTHING:
+            # height above the patch's plane is rate z - level
+            gx, gy = s.patches[n, m, 1], s.patches[n, m, 2]
+            rate = 1 - gx * bx - gy * by
+            level = middle + gx * (ax - x0 - PATCH_M * (m + 0.5))
+            level += gy * (ay - y0 - PATCH_M * (n + 0.5))
+            above = rate * leaves - level
+            if above < 0:
+                top, number, is_side = leaves, n * cols + m, above < -STEP_M
+            elif rate * z - level < 0:
+                top, number, is_side = level / rate, n * cols + m, False
+        z = leaves
+        if next_x < next_y:
+            next_x += per_x
+            m += step_m
+        else:
+            next_y += per_y
+            n += step_n
+        if m < first_i or n < first_j or m > last_i or n > last_j:
+            break
+    return top, number, is_side
+
+
+def greatest(patches: np.ndarray) -> np.ndarray:
+    """Greatest z of each patch, [rows, cols]."""
+    slopes = np.abs(patches[..., 1]) + np.abs(patches[..., 2])
+    return patches[..., 0] + PATCH_M / 2 * slopes
+
 
 NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
 IN_IMAGES, IN_LIDAR, IN_LEFT, IN_RIGHT = 1, 2, 4, 8  # where an object is: bits
@@ -88,6 +151,19 @@ class Surfaces(NamedTuple):
     paint: np.ndarray
 
 
+class Objects(NamedTuple):
+    """Boxes or crowns, the bits of their views, and their style, as in :class:`Surfaces`."""
+
+    shapes: np.ndarray
+    view: np.ndarray
+    style: np.ndarray
+
+
+def join(*objects: Objects) -> Objects:
+    """All objects, one after the other."""
+    return Objects(*map(np.concatenate, zip(*objects)))
+
+
 def direction_of_sun(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
     """Unit vector [3] toward the sun: east, north, up."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
@@ -98,27 +174,29 @@ def direction_of_sun(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
 
 
 @inlined
-def spline_cell(s, x, y):
-    """Column and row of the spline's cell over a plan position, and where in it that lies."""
-    per_step = 1 / s.step
-    u, v = (x - s.x0) * per_step, (y - s.y0) * per_step
-    i = min(max(int(np.floor(u)), 1), s.terrain.shape[1] - 3)
-    j = min(max(int(np.floor(v)), 1), s.terrain.shape[0] - 3)
-    return i, j, u - i, v - j
+def _dot(a, c, j, i):
+    """Product with four coefficients of a row."""
+    return (
+        a[0] * c[j, i]
+        + a[1] * c[j, i + np.uint64(1)]
+        + a[2] * c[j, i + np.uint64(2)]
+        + a[3] * c[j, i + np.uint64(3)]
+    )
 
 
 @inlined
-def _dot(a, c):
-    return a[0] * c[0] + a[1] * c[1] + a[2] * c[2] + a[3] * c[3]
-
-
-@inlined
-def spline(s, f, g, c0, c1, c2, c3):
-    """Terrain z and its derivatives at (f, g) of a cell, by the four rows of coefficients around.
+def terrain_at(s, x, y):
+    """Terrain z and its derivatives along x and y.
 
     From six times the spline's weights and twice their derivatives: a division each would be half
     of the time.
     """
+    c = s.terrain
+    per_step = 1 / s.step
+    u, v = (x - s.x0) * per_step, (y - s.y0) * per_step
+    i = min(max(int(np.floor(u)), 1), c.shape[1] - 3)
+    j = min(max(int(np.floor(v)), 1), c.shape[0] - 3)
+    f, g = u - i, v - j
     f1, g1 = 1 - f, 1 - g
     a = f1 * f1 * f1, 4 + f * f * (3 * f - 6), 4 + f1 * f1 * (3 * f1 - 6), f * f * f
     d = -f1 * f1, f * (3 * f - 4), f1 * (4 - 3 * f1), f * f
@@ -126,32 +204,15 @@ def spline(s, f, g, c0, c1, c2, c3):
     b2, b3 = 4 + g1 * g1 * (3 * g1 - 6), g * g * g
     e0, e1 = -g1 * g1, g * (3 * g - 4)
     e2, e3 = g1 * (4 - 3 * g1), g * g
-    r0, r1, r2, r3 = _dot(a, c0), _dot(a, c1), _dot(a, c2), _dot(a, c3)
-    q0, q1, q2, q3 = _dot(d, c0), _dot(d, c1), _dot(d, c2), _dot(d, c3)
+    # unsigned: signed indices are tested for wrapping around, at half the cost of the spline
+    i0, j0 = np.uint64(i - 1), np.uint64(j - 1)
+    j1, j2, j3 = np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
+    r0, r1, r2, r3 = _dot(a, c, j0, i0), _dot(a, c, j1, i0), _dot(a, c, j2, i0), _dot(a, c, j3, i0)
+    q0, q1, q2, q3 = _dot(d, c, j0, i0), _dot(d, c, j1, i0), _dot(d, c, j2, i0), _dot(d, c, j3, i0)
     z = b0 * r0 + b1 * r1 + b2 * r2 + b3 * r3
     zx = b0 * q0 + b1 * q1 + b2 * q2 + b3 * q3
     zy = e0 * r0 + e1 * r1 + e2 * r2 + e3 * r3
-    per_step = 1 / s.step
     return z * (1 / 36), zx * (per_step / 12), zy * (per_step / 12)
-
-
-@inlined
-def terrain_at(s, x, y):
-    """Terrain z and its derivatives along x and y."""
-    i, j, f, g = spline_cell(s, x, y)
-    c = s.terrain
-    # unsigned: signed indices are tested for wrapping around, at half the cost of the spline
-    j0, j1, j2, j3 = np.uint64(j - 1), np.uint64(j), np.uint64(j + 1), np.uint64(j + 2)
-    i0, i1, i2, i3 = np.uint64(i - 1), np.uint64(i), np.uint64(i + 1), np.uint64(i + 2)
-    return spline(
-        s,
-        f,
-        g,
-        (c[j0, i0], c[j0, i1], c[j0, i2], c[j0, i3]),
-        (c[j1, i0], c[j1, i1], c[j1, i2], c[j1, i3]),
-        (c[j2, i0], c[j2, i1], c[j2, i2], c[j2, i3]),
-        (c[j3, i0], c[j3, i1], c[j3, i2], c[j3, i3]),
-    )
 
 
 @inlined
@@ -231,9 +292,7 @@ def tree_top(trees, n, ax, ay, bx, by):
 
 @inlined
 def cast(s, horizon, ax, ay, bx, by, view, trees, guess):
-    """First surface on a ray from above.
-
-    Returns z, kind, object, face, and of the ground below z and its derivatives along x and y.
+    """First surface on a ray from above: z, kind, object, face; of the ground z and its slopes.
 
     ``view``: bits of the objects seen, as LEFT_VIEW or IN_LIDAR. ``trees``: whether crowns stop
     the ray. ``horizon``: what :func:`horizon` gives for such rays. ``guess``: z near which the
@@ -338,10 +397,8 @@ def in_shadow(s, sun, x, y, z, view):
     bx, by = sun[0] / sun[2], sun[1] / sun[2]
     ax, ay = x - bx * z, y - by * z
     clear = z + 0.02
-    step_x = 1 if bx > 0 else -1
-    step_y = 1 if by > 0 else -1
-    per_x = CELL_M / max(abs(bx), 1e-9)
-    per_y = CELL_M / max(abs(by), 1e-9)
+    step_x, step_y = 1 if bx > 0 else -1, 1 if by > 0 else -1
+    per_x, per_y = CELL_M / max(abs(bx), 1e-9), CELL_M / max(abs(by), 1e-9)
     next_x = (s.x0 + CELL_M * (i + (1 if bx > 0 else 0)) - ax) * (1 / bx)
     next_y = (s.y0 + CELL_M * (j + (1 if by > 0 else 0)) - ay) * (1 / by)
     while z < s.sun_top[j, i]:

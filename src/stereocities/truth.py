@@ -1,10 +1,14 @@
-"""The exact truth of a scene: what each pixel shows, and where the other image has it."""
+"""The exact truth of a scene: what each pixel shows, where the other image has it, what changed.
+
+A ray goes through a pixel of one image and meets the surface of each world: those of both images
+and of the LiDAR. What is highest on the ray and is not in all worlds is the reason of the change.
+"""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import zarr
@@ -14,22 +18,36 @@ from stereotruth.core.job import progress
 from stereotruth.core.kernels import inlined, kernel
 from stereotruth.core.products.grids import PlainStore, atomic_store
 
-from .camera import direction, pose, project_point
+from .appearance import VEHICLE, resurfaced_at
+from .camera import LocalFrame, pose, project_point, world_to_geodetic_point
 from .cities import CitySpec, SceneSpec
-from .dated_worlds import world_of
-from .geodesy import LocalFrame, world_to_geodetic_point
 from .layout import coverage, covered
-from .render import Camera, in_collar, prepare
-from .surfaces import GROUND, IN_LIDAR, NONE, WATER, Surfaces, cast, stands_in, terrain_at
+from .render import Camera, has_data, in_collar, prepare, ray
+from .surfaces import (
+    GROUND,
+    IN_LIDAR,
+    NONE,
+    ROOF,
+    TREE,
+    WALL,
+    WATER,
+    Surfaces,
+    cast,
+    stands_in,
+    terrain_at,
+)
+from .world import world_of
 
 if TYPE_CHECKING:
     import xarray as xr
+
 
 log = logging.getLogger("stereotruth")
 
 
 CHUNK = 512
 SEEN_TOLERANCE_M = 0.02
+SAME_M = 0.01  # on one ray: the same surface
 SURFACES = "none ground roof wall tree water"
 CHANGES = "unchanged in_lidar_only in_images_only"
 LAYERS = {
@@ -58,25 +76,6 @@ FLAGS = {"surface": SURFACES, "changed": CHANGES}
 REALS = [name for name, (dtype, _, _) in LAYERS.items() if dtype == "float64"]
 
 
-class Views(NamedTuple):
-    """Both images: the ``first``, in which positions lie, and the ``second``.
-
-    Each of: its camera; what may stand above the ground (``above``); the bit of what it shows
-    (``shown``); the kind of its ``collar``. ``size``: cols, rows of the first, cols, rows of the
-    second.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    above_first: np.ndarray
-    above_second: np.ndarray
-    shown_first: int
-    shown_second: int
-    collar_first: int
-    collar_second: int
-    size: np.ndarray
-
-
 @inlined
 def seen_from(s, above, x, y, z, line, view, tolerance):
     """Whether nothing hides a world point from the position in ``line``, a camera's pose."""
@@ -96,52 +95,49 @@ def _lies_lower(s, kind, x, y, z):
 
 
 @kernel
-def _truth_points(s, other_s, scanned_s, views, frame, cover, image_col, image_row, real, flags):
-    """The truth at positions [n] of the first of two ``views``; neighbours follow each other.
+def _truth_points(first, second, scanned_s, frame, cover, image_col, image_row, real, flags):
+    """The truth at positions [n] of the ``first`` of two images; neighbours follow each other.
 
-    ``s``, ``other_s``, ``scanned_s``: the worlds of the first image, the second, and the LiDAR.
-
-    real[5, n] and flags[6, n]: values of LAYERS in their order. Positions outside the first
-    frame, in its collar, or NaN get NaN and 0.
+    ``scanned_s``: the LiDAR's world. real[5, n] and flags[6, n]: values of LAYERS in their order.
+    Positions outside the first frame, in its collar, or NaN get NaN and 0.
     """
-    left, right, above_left, above_right, shown, shown_there, collar, collar_there, size = views
     line, other = np.empty(12), np.empty(12)
     guess = 0.0
-    right_row = 0.5 * size[3]
+    right_row = 0.5 * second.rows
     posed = np.nan
     for k in range(image_col.size):
         c, row = image_col[k], image_row[k]
-        if not (
-            c >= -0.5 and row >= -0.5 and c <= size[0] - 0.5 and row <= size[1] - 0.5
-        ) or in_collar(collar, c, row, size[0], size[1]):
+        if not has_data(first, c, row):
             real[:, k] = np.nan
             flags[:, k] = 0
             continue
         if row != posed:
-            pose(left, row, line)
+            pose(first.cam, row, line)
             posed = row
-        dx, dy, dz = direction(left, line, c)
-        bx, by = dx / dz, dy / dz
-        ax, ay = line[0] - bx * line[2], line[1] - by * line[2]
-        z, kind, index, _, ground, _, _ = cast(s, above_left, ax, ay, bx, by, shown, True, guess)
+        ax, ay, bx, by = ray(first.cam, line, c)
+        z, kind, index, _, ground, _, _ = cast(
+            first.surfaces, first.above, ax, ay, bx, by, first.shown, True, guess
+        )
         guess = ground
         x, y = ax + bx * z, ay + by * z
         lon, lat, height = world_to_geodetic_point(frame, x, y, z)
-        col, right_row = project_point(right, x, y, z, right_row, other)
-        free = seen_from(other_s, above_right, x, y, z, other, shown_there, SEEN_TOLERANCE_M)
+        col, right_row = project_point(second.cam, x, y, z, right_row, other)
+        free = seen_from(
+            second.surfaces, second.above, x, y, z, other, second.shown, SEEN_TOLERANCE_M
+        )
         inside = (
             col >= 0
             and right_row >= 0
-            and col <= size[2] - 1
-            and right_row <= size[3] - 1
-            and not in_collar(collar_there, col, right_row, size[2], size[3])
+            and col <= second.cols - 1
+            and right_row <= second.rows - 1
+            and not in_collar(second.collar, col, right_row, second.cols, second.rows)
         )
-        there = inside and stands_in(other_s, kind, index, shown_there, z)
-        there = there and not _lies_lower(other_s, kind, x, y, z)
+        there = inside and stands_in(second.surfaces, kind, index, second.shown, z)
+        there = there and not _lies_lower(second.surfaces, kind, x, y, z)
         scanned, _, _, _, _, _, _ = cast(
-            scanned_s, above_left, ax, ay, bx, by, IN_LIDAR, True, ground
+            scanned_s, first.above, ax, ay, bx, by, IN_LIDAR, True, ground
         )
-        changed = 1 if scanned > z + 0.01 else (2 if scanned < z - 0.01 else 0)
+        changed = 1 if scanned > z + SAME_M else (2 if scanned < z - SAME_M else 0)
         real[0, k], real[1, k], real[2, k] = lon, lat, height
         real[3, k], real[4, k] = col, right_row
         flags[0, k] = free and there
@@ -151,7 +147,7 @@ def _truth_points(s, other_s, scanned_s, views, frame, cover, image_col, image_r
         flags[4, k] = (
             changed == 0
             and inside
-            and seen_from(scanned_s, above_right, x, y, z, other, IN_LIDAR, SEEN_TOLERANCE_M)
+            and seen_from(scanned_s, second.above, x, y, z, other, IN_LIDAR, SEEN_TOLERANCE_M)
             != free
         )
         flags[5, k] = covered(cover, x, y)
@@ -185,24 +181,11 @@ def truth_between(
     What is called right is the second image. ``scanned``: the LiDAR's world. ``cover``: of
     :func:`.layout.coverage`.
     """
-    first, second = cameras
-    size = np.array([first.cols, first.rows, second.cols, second.rows], dtype=np.float64)
+    first, second = (camera.sight for camera in cameras)
     at = [np.ascontiguousarray(a, dtype=np.float64).ravel() for a in (col, row)]
     real = np.empty((len(REALS), at[0].size))
     flags = np.empty((len(LAYERS) - len(REALS), at[0].size), np.uint8)
-    views = Views(
-        first.cam,
-        second.cam,
-        first.horizon,
-        second.horizon,
-        first.shown,
-        second.shown,
-        first.collar,
-        second.collar,
-        size,
-    )
-    worlds = first.surfaces, second.surfaces, scanned
-    _truth_points(*worlds, views, frame.packed(), cover, *at, real, flags)
+    _truth_points(first, second, scanned, frame.packed(), cover, *at, real, flags)
     return dict(zip(LAYERS, (values.reshape(np.shape(col)) for values in (*real, *flags))))
 
 
@@ -264,3 +247,78 @@ def open_truth(path: str | Path) -> xr.Dataset:
     import xarray as xr  # a quarter of a job's start-up, and the job that makes it needs none
 
     return xr.open_zarr(path, consolidated=True, chunks=None)
+
+
+UNCHANGED, BUILT, DEMOLISHED, GROWN_OR_FELLED, MOVED, WATER_LEVEL, GROUND_LEVEL, TEXTURE = range(8)
+CHANGE_LAYERS = {
+    "height": "m above the frame's height: what the pixel's ray meets in the image's world",
+    "height_other": "m: what it meets in the world of the other image",
+    "height_lidar": "m: what it meets in the world of the LiDAR",
+    "reason": "what changed there: one of REASONS",
+}
+REASONS = "none built demolished grown_or_felled moved water ground texture"
+
+
+@inlined
+def _reason(s, kind, index, z, scanned):
+    """Of a surface at height ``z`` that is not in all worlds; ``scanned``: the LiDAR's height."""
+    if kind == TREE:
+        return GROWN_OR_FELLED
+    if kind in (ROOF, WALL):
+        if index >= 0 and s.box_style[index, 2] == VEHICLE:
+            return MOVED
+        return DEMOLISHED if scanned > z - SAME_M else BUILT
+    return WATER_LEVEL if kind == WATER else GROUND_LEVEL
+
+
+@kernel
+def _changes(here, other, scanned_s, image_col, image_row, heights, reason):
+    """Of the image ``here``, the ``other`` one, and the LiDAR's world."""
+    line = np.empty(12)
+    s0, s1 = here.surfaces, other.surfaces
+    z, kind, index = np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(image_col.size):
+        col, row = image_col[n], image_row[n]
+        heights[:, n] = np.nan
+        reason[n] = UNCHANGED
+        if not has_data(here, col, row):
+            continue
+        pose(here.cam, row, line)
+        ax, ay, bx, by = ray(here.cam, line, col)
+        above = here.above
+        z[0], kind[0], index[0], _, _, _, _ = cast(s0, above, ax, ay, bx, by, here.shown, True, 0.0)
+        z[1], kind[1], index[1], _, _, _, _ = cast(
+            s1, above, ax, ay, bx, by, other.shown, True, 0.0
+        )
+        z[2], kind[2], index[2], _, _, _, _ = cast(
+            scanned_s, above, ax, ay, bx, by, IN_LIDAR, True, 0.0
+        )
+        if kind.min() == NONE:
+            continue
+        heights[:, n] = z
+        top = z.argmax()
+        if z.max() - z.min() > SAME_M:
+            of = kind[top]
+            if of == GROUND and (kind == WATER).any():
+                of = WATER  # the water has fallen below a ground that it does not show
+            reason[n] = _reason(s0, of, index[top], z[top], z[2])
+        elif kind[0] == GROUND:
+            x, y = ax + bx * z[0], ay + by * z[0]
+            if resurfaced_at(s0, x, y) != resurfaced_at(s1, x, y):
+                reason[n] = TEXTURE
+
+
+def changes_at(
+    city: CitySpec, scene: SceneSpec, col: np.ndarray, row: np.ndarray, view: str = "left"
+) -> dict[str, np.ndarray]:
+    """The layers of CHANGE_LAYERS at positions (col, row) of an image of a scene, of any one shape.
+
+    ``view``: left or right. Outside the image and in its collar heights are NaN, reasons none.
+    """
+    ready = prepare(city, scene)
+    images = (ready.left.sight, ready.right.sight)[:: 1 if view == "left" else -1]
+    at = [np.ascontiguousarray(a, dtype=np.float64).ravel() for a in (col, row)]
+    heights, reason = np.empty((3, at[0].size)), np.empty(at[0].size, np.uint8)
+    _changes(*images, world_of(city, ready.surfaces, "lidar"), *at, heights, reason)
+    layers = (values.reshape(np.shape(col)) for values in (*heights, reason))
+    return dict(zip(CHANGE_LAYERS, layers))

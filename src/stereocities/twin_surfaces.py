@@ -18,14 +18,12 @@ from scipy.spatial import cKDTree
 
 from stereotruth.core.kernels import inlined, kernel
 
-from .patches import NOTHING, PATCH_M
-from .twin_points import Points
+from .surfaces import NOTHING, PATCH_M
 
+CLASSED_SHARE = 0.01  # of the points: less of a class, and its class was not looked for
 NEIGHBOURS = 10  # by which the plane of a point is told
 THIN_M = 0.4  # one point at most in a square of this side
-SEED_ROUGH_M = (
-    0.12  # rms of the neighbours off their plane: less for a point that a plane begins with
-)
+SEED_ROUGH_M = 0.12  # rms of the neighbours off the plane of a point that one begins with
 OFF_M = 0.18  # of a plane: a point so near belongs to it
 JOIN_M = 0.45  # what no plane took up joins the one beside it, so near
 TURN = math.cos(math.radians(28))  # of the normals within a plane
@@ -41,6 +39,26 @@ BUILDING_M2 = 400.0  # of one among others that it touches
 SEAM_M = 0.35  # planes that come so near each other meet in a ridge or a valley
 SEAM = 3  # patches to each side, among which such a plane is sought
 SIDE_M = 1.0  # over which the directions of sides are smoothed
+
+
+class Points(NamedTuple):
+    """Points of a place: ``xyz`` float64[n, 3] in the world frame; ``label`` uint8[n]: class of
+    LAS; ``single``, ``first`` bool[n]: the only, the first return of its pulse; ``tint``
+    float32[n]: reflectance, None where the file tells none."""
+
+    xyz: np.ndarray
+    label: np.ndarray
+    single: np.ndarray
+    first: np.ndarray
+    tint: np.ndarray | None
+
+    def which(self, use: np.ndarray) -> Points:
+        """The points of a mask or of indices."""
+        return Points(*(None if values is None else values[use] for values in self))
+
+    def has_class(self, *labels: int) -> bool:
+        """Whether the file tells which points are of these classes."""
+        return bool(np.isin(self.label, labels).mean() > CLASSED_SHARE)
 
 
 class Planes(NamedTuple):
@@ -147,12 +165,8 @@ def _grow(xyz, near, normal, rough, order, number, planes):
             for k in range(size):
                 number[queue[k]] = -1
             continue
-        planes[count, 0], planes[count, 1], planes[count, 2] = (
-            plane[0] + ox,
-            plane[1] + oy,
-            plane[2] + oz,
-        )
-        planes[count, 3:] = plane[3:]
+        planes[count, 0], planes[count, 1] = plane[0] + ox, plane[1] + oy
+        planes[count, 2], planes[count, 3:] = plane[2] + oz, plane[3:]
         count += 1
     return count
 
@@ -359,20 +373,16 @@ def is_ground(points: Points) -> np.ndarray:
     around = ndimage.median_filter(lowest, 5, mode="nearest")
     lowest = np.where(lowest < around - LOW_M, around, lowest)
     surface, is_object = lowest, np.zeros(lowest.shape, bool)
-    for half in _windows():
+    half = 1
+    while True:  # half widths of the openings, cells
         opened = ndimage.grey_opening(surface, size=2 * half + 1, mode="nearest")
         is_object |= surface - opened > STEEP * half * FILTER_M
         surface = opened
+        if half * FILTER_M >= WIDEST_M:
+            break
+        half = math.ceil(1.5 * half)
     ground = _filled(np.where(is_object, np.inf, lowest))
     return np.abs(points.xyz[:, 2] - ground[j, i]) < NEAR_M
-
-
-def _windows() -> list[int]:
-    """Half widths of the openings, cells: each some half wider than the one before."""
-    halves = [1]
-    while halves[-1] * FILTER_M < WIDEST_M:
-        halves.append(math.ceil(1.5 * halves[-1]))
-    return halves
 
 
 def _filled(heights: np.ndarray) -> np.ndarray:

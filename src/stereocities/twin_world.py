@@ -10,25 +10,25 @@ import logging
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
+import laspy
 import numpy as np
+import pyproj
 
 from stereotruth.core.errors import InputError
 
 from .appearance import PAINT
+from .camera import LocalFrame
 from .cities import LEFT_GSD_M, Character, CitySpec, SceneSpec, Twin
-from .dated_worlds import dated_patches
-from .geodesy import LocalFrame
 from .layout import draw_zones, extent, frame_of, image_axes
-from .patches import PATCHES_A_CELL, greatest
 from .rpcs import read_rpc
-from .surfaces import CELL_M, Surfaces, terrain_heights
-from .twin_points import Points, extent_of, read_points
+from .surfaces import CELL_M, PATCHES_A_CELL, Surfaces, terrain_heights
 from .twin_surfaces import (
     OBJECT_M,
     STEP_M,
     Crowns,
-    Planes,
+    Points,
     buildings_of,
     crowns_of,
     is_ground,
@@ -38,6 +38,111 @@ from .twin_surfaces import (
     terrain_of,
     thinned,
 )
+
+log = logging.getLogger("stereotruth")
+
+NOISE = (7, 18)  # classes of LAS
+POINTS_A_CHUNK = 2_000_000
+TONE = 2.2  # exponent of the tone curve of colours
+MIDDLE = 0.25  # reflectance of a point of median intensity
+DARKEST, BRIGHTEST = 0.04, 0.75  # reflectance
+GIVE_CRS = "give the coordinate system of the points, as --crs EPSG:2154"
+
+
+class Extent(NamedTuple):
+    """Where the points of a file lie: ``crs`` of their plan positions, ``low`` and ``high`` [3] in
+    the units of the file, ``unit_m``: metres of a unit of height."""
+
+    crs: pyproj.CRS
+    low: np.ndarray
+    high: np.ndarray
+    unit_m: float
+
+    def to_geodetic(self, xyz: np.ndarray) -> np.ndarray:
+        """Longitude, latitude (degrees), height (m) [n, 3] of points [n, 3] of the file."""
+        transformer = pyproj.Transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
+        lon, lat = transformer.transform(xyz[:, 0], xyz[:, 1])
+        return np.column_stack([lon, lat, self.unit_m * xyz[:, 2]])
+
+
+def extent_of(file: str | Path, crs: str = "") -> Extent:
+    """Extent of a LAS or LAZ file by its header. ``crs``: of a file that declares none.
+
+    Raises InputError: no file of points, none in it, or no coordinate system.
+    """
+    file = Path(file)
+    points = "name a LAS or LAZ file of a place's points"
+    if not file.is_file():
+        raise InputError("there is no such file", file=file, remedy=points)
+    try:
+        with laspy.open(file) as source:
+            header = source.header
+            declared = None if crs else header.parse_crs()
+    except (laspy.LaspyException, pyproj.exceptions.CRSError, ValueError) as error:
+        raise InputError(
+            f"cannot be read as LAS or LAZ: {error}", file=file, remedy=points
+        ) from None
+    if not header.point_count:
+        raise InputError("has no points", file=file, remedy=points)
+    if not crs and declared is None:
+        what = "declares no coordinate system that an EPSG code or WKT names"
+        raise InputError(what, file=file, remedy=GIVE_CRS)
+    try:
+        full = pyproj.CRS.from_user_input(crs) if crs else declared
+    except pyproj.exceptions.CRSError:
+        what = f"{crs!r} is no coordinate system"
+        raise InputError(what, file=file, remedy=GIVE_CRS) from None
+    plan = full.sub_crs_list[0] if full.is_compound else full
+    if not (plan.is_projected or plan.is_geographic):
+        what = f"the coordinate system {plan.name} has no positions in plan"
+        raise InputError(what, file=file, remedy=GIVE_CRS)
+    axes = full.axis_info
+    upward = axes[2] if len(axes) > 2 else axes[0]
+    unit = upward.unit_conversion_factor if plan.is_projected or len(axes) > 2 else 1.0
+    return Extent(plan.to_2d(), np.array(header.mins), np.array(header.maxs), float(unit))
+
+
+def read_points(twin: Twin, frame: LocalFrame) -> Points:
+    """All points of a place but noise and withheld ones."""
+    extent = extent_of(twin.file, twin.crs)
+    parts = []
+    with laspy.open(twin.file) as source:
+        names = set(source.header.point_format.dimension_names)
+        for cloud in source.chunk_iterator(POINTS_A_CHUNK):
+            label = np.asarray(cloud.classification, np.uint8)
+            use = ~np.isin(label, NOISE) & (np.asarray(cloud.withheld) == 0)
+            xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[use]
+            parts.append((
+                frame.from_geodetic(extent.to_geodetic(xyz)),
+                label[use],
+                np.asarray(cloud.number_of_returns)[use] <= 1,
+                np.asarray(cloud.return_number)[use] <= 1,
+                np.asarray(cloud.intensity)[use],
+                _grey(cloud, names, use),
+            ))  # fmt: skip
+    xyz, label, single, first, echo, grey = (np.concatenate(of) for of in zip(*parts))
+    log.info("%s: %.2f million points", Path(twin.file).name, len(xyz) / 1e6)
+    return Points(xyz, label, single, first, _tint(echo, grey))
+
+
+def _grey(cloud: laspy.ScaleAwarePointRecord, names: set[str], use: np.ndarray) -> np.ndarray:
+    """Mean of the colours of points; 0 where a file has none."""
+    if not {"red", "green", "blue"} <= names:
+        return np.zeros(int(use.sum()), np.float32)
+    colours = (np.asarray(cloud[c])[use] for c in ("red", "green", "blue"))
+    return (sum(c.astype(np.float32) for c in colours) / 3).astype(np.float32)
+
+
+def _tint(echo: np.ndarray, grey: np.ndarray) -> np.ndarray | None:
+    """Reflectance of points by their colours, else by their intensity, else None."""
+    if len(grey) and np.ptp(grey) > 0:
+        full = 65535.0 if grey.max() > 255 else 255.0
+        return np.clip((grey / full) ** TONE, DARKEST, BRIGHTEST).astype(np.float32)
+    if len(echo) and np.ptp(echo) > 0:
+        scaled = MIDDLE * echo.astype(np.float64) / max(float(np.median(echo)), 1.0)
+        return np.clip(scaled, DARKEST, BRIGHTEST).astype(np.float32)
+    return None
+
 
 log = logging.getLogger("stereotruth")
 
@@ -78,7 +183,11 @@ def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, Crowns]:
     low = np.flatnonzero(low)
     low = low[thinned(points.xyz[low], GROUND_M)]
     found = planes_of(points.xyz[roofs])
-    tint = _tints(points, found, roofs, low, rng)
+    if points.tint is not None:
+        tint = points.tint[roofs], points.tint[low]
+    else:  # drawn for each roof, and the ground (0) has no paint
+        drawn = np.append(rng.uniform(*ROOF_LIGHT, len(found.plane)), 0.0)
+        tint = drawn[found.number], np.zeros(len(low))
     first = np.floor((points.xyz[:, :2].min(axis=0) - box[:2]) / CELL_M).astype(int)
     last = np.floor((points.xyz[:, :2].max(axis=0) - box[:2]) / CELL_M).astype(int) + 1
     raster = rasterised(
@@ -97,36 +206,6 @@ def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, Crowns]:
         patch_j=int(first[1]), paint=np.rint(raster.paint * PAINT).astype(np.uint16),
     )  # fmt: skip
     return s, crowns
-
-
-def _tints(
-    points: Points, found: Planes, roofs: np.ndarray, low: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Reflectance of the points on roofs and on the ground.
-
-    Where the file tells none, it is drawn for each roof, and the ground (0) has no paint.
-    """
-    if points.tint is not None:
-        return points.tint[roofs], points.tint[low]
-    drawn = np.append(rng.uniform(*ROOF_LIGHT, len(found.plane)), 0.0)
-    return drawn[found.number], np.zeros(len(low))
-
-
-def patch_tops(city: CitySpec, s: Surfaces) -> np.ndarray:
-    """Greatest z of the patches in each cell of a city at any date, as its ``cell_top``."""
-    top = np.full(s.cell_top.shape, -1e9)
-    if not s.patches.size:
-        return top
-    rows, cols = (n // PATCHES_A_CELL for n in s.patches.shape[:2])
-    highest = greatest(s.patches.astype(np.float64))
-    if city.dates is not None:
-        for passed in (0.0, 1.0):
-            of = dated_patches(city, s, passed)
-            highest = np.maximum(highest, greatest(of.astype(np.float64)))
-    cells = highest.reshape(rows, PATCHES_A_CELL, cols, PATCHES_A_CELL)
-    # rays are not followed where a cell ends: what is left over for rounding
-    top[s.patch_j : s.patch_j + rows, s.patch_i : s.patch_i + cols] = cells.max(axis=(1, 3)) + 1e-3
-    return top
 
 
 MARGIN_PX = 30  # of the left image around the points
@@ -164,11 +243,8 @@ def twin_city(
     middle = (low + high) / 2
     lon, lat, _ = of.to_geodetic(middle[None])[0]
     if not (abs(lon) <= 360 and abs(lat) <= 90):
-        raise InputError(
-            f"lies outside of what {of.crs.name} covers",
-            file=file,
-            remedy="give the coordinate system of the points, as --crs EPSG:2154",
-        )
+        what = f"lies outside of what {of.crs.name} covers"
+        raise InputError(what, file=file, remedy=GIVE_CRS)
     base = math.floor(of.unit_m * low[2])
     frame = LocalFrame(float(lon), float(lat), float(base))
     ends = np.array([[high[0], middle[1], low[2]], [middle[0], high[1], low[2]]])
@@ -190,9 +266,19 @@ def twin_city(
         scenes=(scene,),
         sun_azimuth_deg=sun_deg[0],
         sun_elevation_deg=sun_deg[1],
-        twin=Twin(str(file), crs, half, math.atan2(right[1], right[0]), _read_once(rpcs)),
+        twin=Twin(
+            str(file),
+            crs,
+            half,
+            math.atan2(right[1], right[0]),
+            None if rpcs is None else tuple(str(read_rpc(file).file) for file in rpcs),
+        ),
     )
-    cols, rows = size_px or _all_of_it(city, scene, right, up)
+    cols, rows = size_px or (
+        math.ceil(2 * (abs(float(axis @ right)) + abs(float(axis @ up))) / LEFT_GSD_M)
+        + 2 * MARGIN_PX
+        for axis in image_axes(city, scene)
+    )
     if max(cols, rows) > MOST_PX:
         raise InputError(
             f"would be {cols} x {rows} px of {LEFT_GSD_M} m, and {MOST_PX} are the most",
@@ -200,22 +286,3 @@ def twin_city(
             remedy="give a part of it about its middle, as --size 2000 2000, or cut the file",
         )
     return replace(city, scenes=(replace(scene, cols=cols, rows=rows),))
-
-
-def _read_once(rpcs: tuple[str | Path, str | Path] | None) -> tuple[str, str] | None:
-    """The names of files of RPCs that can be read."""
-    if rpcs is None:
-        return None
-    left, right = (str(read_rpc(file).file) for file in rpcs)
-    return left, right
-
-
-def _all_of_it(
-    city: CitySpec, scene: SceneSpec, right: np.ndarray, up: np.ndarray
-) -> tuple[int, int]:
-    """Columns and rows of a left image that shows all points; half axes ``right``, ``up`` [2]."""
-    sides = []
-    for axis in image_axes(city, scene):
-        reach = abs(float(axis @ right)) + abs(float(axis @ up))
-        sides.append(math.ceil(2 * reach / LEFT_GSD_M) + 2 * MARGIN_PX)
-    return sides[0], sides[1]

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from stereocities.__main__ import make_scene
+from stereocities.sites import make_scene
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.labels import project
 from stereotruth.labels.scene_inputs import SceneInputs

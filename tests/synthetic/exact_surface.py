@@ -9,10 +9,10 @@ import pyproj
 import rasterio
 from rasterio.transform import from_origin
 
-from stereocities.built_city import top_surface
 from stereocities.cities import CitySpec, SceneSpec
 from stereocities.layout import half_size
 from stereocities.surfaces import IN_LIDAR
+from stereocities.world import top_surface
 
 
 def grid_of(city: CitySpec, scene: SceneSpec, cell_m: float, inset_m: float = 10.0):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereocities.site_images import camera_of
-from stereocities.sites import ImageSpec, SiteSpec
+from stereocities.sites import ImageSpec, SiteSpec, camera_of
 from stereotruth.sensor.rpc import RPC, SensorModel
 from stereotruth.sensor.site_pairs import SiteImage
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from stereobench.networks import keras_weights
+from stereobench.networks import weights
 from stereobench.networks.inference import NetworkMethod
 from stereobench.networks.weights import SavedNetwork
 
@@ -26,10 +26,10 @@ def write_as_keras(network: torch.nn.Module, path: Path) -> None:
     """A file as Keras makes it: names that mean nothing, arrays in calling order."""
     with h5py.File(path, "w") as file:
         names = []
-        for number, part in enumerate(keras_weights._parts(network)):
+        for number, part in enumerate(weights._parts(network)):
             group = file.create_group(f"part_{9 - number}")
             arrays = []
-            for k, (tensor, axes) in enumerate(keras_weights._slots(part)):
+            for k, (tensor, axes) in enumerate(weights._slots(part)):
                 array = tensor.detach().numpy().transpose(np.argsort(axes))
                 group[f"w_{100 - k}"] = array
                 arrays.append(f"w_{100 - k}")

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from stereocities.__main__ import make_scene
+from stereocities.sites import make_scene
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, row_of
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import rasterio
 
-from stereobench.methods.scenes.surface_model import Raster
+from stereobench.methods.surface_model import Raster
 from stereotruth.core.products.grids import open_grid
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluate.epipolar_truth import truth_window

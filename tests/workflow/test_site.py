@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereocities.site_images import image_truth
+from stereocities.sites import image_truth
 from stereotruth.core.products.grids import open_grid
 from stereotruth.lidar.catalogue_list import ListedTile, TileList, write_list
 from stereotruth.lidar.lattice import Footprint

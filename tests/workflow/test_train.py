@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
-pytest.importorskip("tqdm", reason="tqdm is not installed: make test-networks")
 
 from ..synthetic.project import Project, copy_project
 from ..synthetic.small_pairs import RANGE, small_dataset

@@ -20,9 +20,7 @@ rule predict_scene:
         sources=upstream("predict_scene"),
         method=lambda w: method_entry(w.method, prediction_dataset()),
         settings=lambda w: scene_prediction(),
-        code=lambda w: source_digest(
-            "stereobench.methods.scenes.predict_scene", *method_modules(w.method)
-        ),
+        code=lambda w: source_digest("stereobench.methods.predict_scene", *method_modules(w.method)),
     message:
         "Disparities of scene {wildcards.scene} by {wildcards.method}"
     script:
@@ -48,7 +46,7 @@ rule dsm:
     params:
         sources=upstream("dsm"),
         settings=SETTINGS.predict.dsm.model_dump(),
-        code=source_digest("stereobench.methods.scenes.surface_model"),
+        code=source_digest("stereobench.methods.surface_model"),
     message:
         "Surface model of scene {wildcards.scene} by {wildcards.method}"
     script:

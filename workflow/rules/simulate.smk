@@ -15,7 +15,7 @@ rule simulate_city:
         runtime=30,
     params:
         sources=upstream("simulate_city"),
-        code=source_digest("stereocities.built_city", "stereocities.cities"),
+        code=source_digest("stereocities.world", "stereocities.cities"),
     message:
         "Building synthetic city {wildcards.city}"
     script:

@@ -1,6 +1,6 @@
 """A scene's disparities to a surface model."""
 
-from stereobench.methods.scenes.surface_model import write_dsm
+from stereobench.methods.surface_model import write_dsm
 from stereotruth.core.job import dask_scheduler
 from stereotruth.core.products.making import rule_job
 

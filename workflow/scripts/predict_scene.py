@@ -1,6 +1,6 @@
 """A stereo method over a whole scene."""
 
-from stereobench.methods.scenes.predict_scene import predict_scene
+from stereobench.methods.predict_scene import predict_scene
 from stereotruth.core.config.methods import SceneMatching
 from stereotruth.core.job import dask_scheduler
 from stereotruth.core.products.making import rule_job

@@ -1,6 +1,5 @@
 """What stands in a synthetic city, for the jobs that look at it."""
 
-from stereocities.built_city import write_surfaces
 from stereocities.cities import city_of
 from stereotruth.core.products.making import rule_job
 

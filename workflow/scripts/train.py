@@ -11,8 +11,7 @@ if __name__ == "__main__":
     with rule_job(snakemake, f"train {of.dataset} {of.method}"):
         need_pytorch(of.method, params.kind)
         from stereobench.networks.training import train
-        from stereobench.networks.training_settings import TrainingSettings
-        from stereobench.networks.training_state import model_of
+        from stereobench.networks.training_state import TrainingSettings, model_of
 
         dataset = StereoDataset.of(of.dataset, params.dataset)
         training = TrainingSettings(**params.training)

@@ -247,17 +247,17 @@ KINDS = {
         files=_pipeline,
         extra="pandora",
     ),
-    "stereonet": _network("StereoNet", "stereonet:StereoNet"),
-    "psmnet": _network("PSM-Net", "psmnet:PSMNet"),
-    "hmsmnet": _network("HMSM-Net", "hmsmnet:HMSMNet"),
+    "stereonet": _network("StereoNet", "cost_volume_networks:StereoNet"),
+    "psmnet": _network("PSM-Net", "cost_volume_networks:PSMNet"),
+    "hmsmnet": _network("HMSM-Net", "cost_volume_networks:HMSMNet"),
     "densemapnet": _network("DenseMapNet", "densemapnet:DenseMapNet"),
     "function": Kind(
-        module="stereobench.methods.user_function",
+        module="stereobench.methods.user_methods",
         settings=("function", "options", "margin_px"),
         files=_code,
     ),
     "command": Kind(
-        module="stereobench.methods.user_command",
+        module="stereobench.methods.user_methods",
         settings=("command", "pairs", "suffix", "uncertainty", "files", "margin_px"),
         files=_program,
     ),
@@ -310,8 +310,8 @@ def need_pytorch(name: str, kind: str) -> None:
             f"method {name!r} is of kind {kind!r}, which is not trained",
             remedy=f"take one of kind {', '.join(NETWORKS)}, or give it weights",
         )
-    if not all(map(find_spec, ("torch", "tqdm"))):
+    if not find_spec("torch"):
         raise InputError(
-            f"{kind} needs PyTorch and tqdm, which are not installed",
+            f"{kind} needs PyTorch, which is not installed",
             remedy=install_extra(KINDS[kind].extra),
         )

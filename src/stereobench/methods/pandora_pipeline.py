@@ -1,29 +1,13 @@
 """CNES's Pandora with libsgm (both Apache-2.0) as a stereo method: kind ``pandora``.
 
-``pipeline`` of an entry is a JSON file as Pandora reads it, of which its section ``pipeline``
-counts; without one, :data:`PIPELINE` is taken: census of 5 × 5 px, libsgm's eight paths, sub-pixel
-disparities by V-fit, a median of 5 × 5 px and the left-right check. Its penalties and filter are
-those that did best on parts of three training tiles of synthetic cities.
-
-``pipeline: mccnn`` has the costs of CNES's MC-CNN (fast; Apache-2.0) in the place of census:
-features of windows of 11 × 11 px, compared by their cosine. The network learned them on the Data
-Fusion Contest; its weights come with the package ``MCCNN``. The penalties are 2.3 and 55.9, as
-published for the fast network (Žbontar & LeCun, JMLR 2016). All other steps are as above.
+Without a pipeline of the user's, :data:`PIPELINE` is taken; its penalties and filter are those that
+did best on parts of three training tiles of synthetic cities. ``pipeline: mccnn`` has the costs of
+CNES's MC-CNN (fast; Apache-2.0) in the place of census, with the penalties that were published for
+the fast network (Žbontar & LeCun, JMLR 2016).
 
 Pandora's disparity is x_right − x_left: it searches (−high, −low], and its result changes sign.
-Pixels that its validity mask calls invalid are NaN.
-
-The standard uncertainty comes from the last step ``cost_volume_confidence`` of the pipeline that
-has one of these methods, if any:
-
-===============  ==================================================================================
-interval_bounds  half the width of the interval, divided by that of a normal distribution whose
-                 central interval has the possibility threshold (0.9) as its probability; at
-                 least 0.6 px, since bounds are whole px on either side
-ambiguity        1 px × (1 − confidence): it puts pixels in order, and its size means nothing
-===============  ==================================================================================
-
-Images in colour are matched as grey. Nodata (0) is masked. Pandora works with one thread.
+Pixels that its validity mask calls invalid are NaN. Images in colour are matched as grey. Nodata
+(0) is masked. Pandora works with one thread. config/README.md has the standard uncertainties.
 """
 
 from __future__ import annotations

@@ -10,15 +10,6 @@ so that every pixel has a disparity; it is invalid (NaN) where its match lies ou
 image, where either image has no data, outside the disparity range, and where OpenCV says so
 (uniqueness, left-right check, speckles).
 
-``uncertainty`` of an entry states a standard uncertainty, which takes more time:
-
-==========  =======================================================================================
-left_right  the spread (:mod:`.matcher`) between the disparities of left pixels and those of their
-            matches, of a second matching with the right image as reference
-peak_ratio  1 px × the mean grey difference of 5 × 5 px at the disparity over the least one at any
-            disparity that is 2 px or more away: it puts pixels in order, and its size means nothing
-==========  =======================================================================================
-
 The defaults are those that did best on eight training and validation tiles of four synthetic
 cities: EPE 0.91 px, D1 6.2 %, holes filled. OpenCV's sample (block 5, p2 32 times its pixels,
 gradients up to 63) has 1.26 px and 9.1 % there; grey values mapped linearly from end to end 7.2 %,
@@ -88,8 +79,8 @@ class SemiGlobalMatcher:
     pixels of the block. ``uniqueness_percent``: by which the best cost must beat the next.
     ``left_right_px``: largest difference of the two directions; null: no check.
     ``speckle_px``: smaller patches of disparities within ``speckle_range_px`` are invalid; 0: none.
-    ``prefilter_cap``: bound of the horizontal gradients that are compared. ``uncertainty``: see the
-    module; null: none is stated. ``workers``: threads, in modes that have any.
+    ``prefilter_cap``: bound of the horizontal gradients that are compared. ``uncertainty``: see
+    config/README.md; null: none is stated. ``workers``: threads, in modes that have any.
     """
 
     mode: str = "hh4"

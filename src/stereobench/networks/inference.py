@@ -1,16 +1,9 @@
-"""The stereo networks as methods of the benchmark: scaling of images, weight files, inference.
+"""The stereo networks as methods of the benchmark: device, precision, range, uncertainty.
 
-``uncertainty`` of an entry states a standard uncertainty:
-
-=======  ==========================================================================================
-entropy  the standard deviation of a uniform distribution as wide as the planes that the last
-         softmax is spread over, by the exponential of its entropy (:func:`.layers.perplexity`)
-flips    the spread (:func:`..matcher.spread`) between the disparities of the pair and of the pair
-         upside down, which takes twice the time
-=======  ==========================================================================================
-
-A weight file (``.pt``) holds a network's weights and what is needed to use them: kind, disparity
-range, channels, scaling of the images, and where they come from.
+``uncertainty`` of an entry states a standard uncertainty: by the ``entropy`` of the last softmax
+(the standard deviation of a uniform distribution as wide as the planes that it is spread over, see
+:func:`.layers.perplexity`), or by ``flips``, the spread (:func:`..methods.matcher.spread`) between
+the disparities of the pair and of the pair upside down.
 """
 
 from __future__ import annotations
@@ -31,9 +24,16 @@ from torch import Tensor, nn
 from stereotruth.core.errors import InputError
 
 from ..methods.matcher import spread
-from .keras_weights import read_keras
 from .layers import channels_last, perplexity, resize
-from .weights import SavedNetwork, Scaling, covering, image_statistics, load_weights, scaled
+from .weights import (
+    SavedNetwork,
+    Scaling,
+    covering,
+    image_statistics,
+    load_weights,
+    read_keras,
+    scaled,
+)
 
 log = logging.getLogger("stereotruth")
 
@@ -219,7 +219,7 @@ def load_network(
 ) -> tuple[SavedNetwork, nn.Module]:
     """The network of a file, which tells its kind itself; one of Keras is taken for ``kind``.
 
-    ``scaling``: of the images for a file of Keras, see :func:`keras_weights.read_keras`.
+    ``scaling``: of the images for a file of Keras, see :func:`.weights.read_keras`.
     Raises InputError if there is no such file, or it does not hold the network's weights.
     """
     if Path(path).suffix in (".h5", ".hdf5"):

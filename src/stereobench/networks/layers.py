@@ -344,23 +344,18 @@ def _overlap(d: int, width: int) -> tuple[slice, slice]:
     return slice(first, end), slice(first - d, end - d)
 
 
-def soft_argmin(cost: Tensor, first: float, step: float = 1.0) -> Tensor:
+class SoftArgmin(nn.Module):
     """Expected disparity of each pixel: [N, D, H, W] costs of the planes -> [N, H, W] float32.
 
     Plane k stands for ``first + k * step``; its probability is the softmax of its negative cost
-    (GC-Net, Kendall et al. 2017).
+    (GC-Net, Kendall et al. 2017). A part of a network, so that who looks on sees the costs.
     """
-    candidates = first + step * torch.arange(cost.shape[1], device=cost.device)
-    probability = torch.softmax(-cost.float(), 1)
-    return torch.einsum("ndhw,d->nhw", probability, candidates.float())
-
-
-class SoftArgmin(nn.Module):
-    """:func:`soft_argmin` as a part of a network, so that who looks on sees the costs."""
 
     def forward(self, cost: Tensor, first: float, step: float = 1.0) -> Tensor:
-        """See the function."""
-        return soft_argmin(cost, first, step)
+        """See the class."""
+        candidates = first + step * torch.arange(cost.shape[1], device=cost.device)
+        probability = torch.softmax(-cost.float(), 1)
+        return torch.einsum("ndhw,d->nhw", probability, candidates.float())
 
 
 def perplexity(cost: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,6 @@ import torch.distributed as dist
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
-from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import progress
@@ -34,13 +32,12 @@ from stereotruth.tiles.stereo_dataset import StereoDataset
 from .inference import choose_device, mixed, padding, precision_of
 from .layers import channels_last
 from .training_pairs import LabelledPairs
-from .training_settings import TrainingSettings, check_crop
 from .training_state import (
     FORMAT,
     TrainingJob,
+    TrainingSettings,
     TrainingState,
     freeze_parts,
-    learning_rate_of,
     make_optimiser,
     publish_training,
     read_state,
@@ -76,12 +73,6 @@ def loss_of(outputs: Sequence[Tensor], disparity: Tensor, weights: Sequence[floa
 log = logging.getLogger("stereotruth")
 
 
-def _set_training(network: nn.Module, frozen: Sequence[nn.Module]) -> None:
-    network.train()
-    for part in frozen:  # with the statistics that its weights were trained with
-        part.eval()
-
-
 def train(
     model: SavedNetwork,
     dataset: StereoDataset,
@@ -98,7 +89,11 @@ def train(
     network or the pairs, or if the loss is no number any more.
     """
     network = start(model, training)
-    check_crop(network, training.crop_px)
+    if any(side % network.divisor for side in training.crop_px or ()):
+        raise InputError(
+            f"training.crop_px {list(training.crop_px)}: no multiples of {network.divisor} px",
+            remedy=f"{type(network).__name__} needs them",
+        )
     data = LabelledPairs.of(
         dataset,
         "train",
@@ -184,14 +179,20 @@ def _run(job: TrainingJob, rank: int, network: nn.Module, device: torch.device) 
                 },
             )
 
-    while state.epoch < training.epochs and not _over(training, state):
+    most_seconds = np.inf if training.hours is None else 3600 * training.hours
+    while state.epoch < training.epochs and state.seconds < most_seconds:
         for group in optimiser.param_groups:
-            group["lr"] = learning_rate_of(training, state.epoch)
-        _set_training(network, frozen)
+            halvings = state.epoch // training.halve_every_epochs
+            group["lr"] = training.learning_rate * 0.5**halvings
+        network.train()
+        for part in frozen:  # with the statistics that its weights were trained with
+            part.eval()
         began = saved = time.monotonic()
         steps = _steps(job, state.epoch)
         before = state.seconds
-        for left, right, disparity in _shown(job, rank, state, steps[state.step :]):
+        batches = _batches(job, state.epoch, steps[state.step :], rank)
+        title = f"epoch {state.epoch + 1} of {training.epochs}"
+        for left, right, disparity in progress(batches, len(steps) - state.step, title):
             left, right, disparity = (t.to(device) for t in (left, right, disparity))
             optimiser.zero_grad(set_to_none=True)
             with mixed(precision, device):
@@ -219,27 +220,6 @@ def _run(job: TrainingJob, rank: int, network: nn.Module, device: torch.device) 
         if not alone:
             dist.barrier()
         keep()
-
-
-def _shown(
-    job: TrainingJob, rank: int, state: TrainingState, steps: Sequence[Sequence[int]]
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """The batches of these steps, with a bar on a terminal and lines in the log."""
-    title = f"epoch {state.epoch + 1} of {job.training.epochs}"
-    batches = progress(_batches(job, state.epoch, steps, rank), len(steps), title)
-    hidden = None if rank == 0 else True  # None: where there is no terminal
-    with (
-        logging_redirect_tqdm([log] if log.handlers else []),
-        tqdm(batches, title, len(steps), leave=False, disable=hidden, unit="step") as bar,
-    ):
-        for batch in bar:
-            if state.step:
-                bar.set_postfix(loss=f"{state.loss / state.step:.3f}")
-            yield batch
-
-
-def _over(training: TrainingSettings, state: TrainingState) -> bool:
-    return training.hours is not None and state.seconds >= 3600 * training.hours
 
 
 def _end_epoch(
@@ -294,21 +274,17 @@ def _steps(job: TrainingJob, epoch: int) -> list[list[int]]:
     return [order[k : k + size].tolist() for k in range(0, len(order) - size + 1, size)]
 
 
-def _batches(
-    job: TrainingJob, epoch: int, steps: Sequence[Sequence[int]], rank: int
-) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """This process' share of each step."""
+def _batches(job: TrainingJob, epoch: int, steps: Sequence[Sequence[int]], rank: int) -> DataLoader:
+    """This process' share of each step: left, right, disparity."""
     job.data.epoch = epoch
     mine = [list(step[rank :: job.processes]) for step in steps]
     workers = job.training.loader_workers
-    return iter(
-        DataLoader(
-            job.data,
-            batch_sampler=mine,
-            num_workers=workers,
-            pin_memory=job.device == "cuda",
-            multiprocessing_context="forkserver" if workers else None,
-        )
+    return DataLoader(
+        job.data,
+        batch_sampler=mine,
+        num_workers=workers,
+        pin_memory=job.device == "cuda",
+        multiprocessing_context="forkserver" if workers else None,
     )
 
 

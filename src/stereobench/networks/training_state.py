@@ -1,4 +1,4 @@
-"""The state of a training between steps, and what a training leaves.
+"""How a network is trained, the state of a training between steps, and what a training leaves.
 
 State: start, file, what is frozen, learning rate. Left are weights, curves, a figure, a summary.
 """
@@ -18,6 +18,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from stereotruth.core.config.methods import Training
+from stereotruth.core.config.section import Whole
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import atomic_file, write_table
 from stereotruth.core.products.making import Marks, marks, refuse_replaced
@@ -27,12 +29,26 @@ from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from .inference import load_network
 from .training_pairs import LabelledPairs
-from .training_settings import TrainingSettings
 from .weights import SavedNetwork, covering, load_weights, save_weights, scaling_of
 
+
+class TrainingSettings(Training):
+    """How a network is trained, with what does not stand in the section training."""
+
+    threads: Whole = 0
+    seed: Whole = 0
+
+    def on(self, threads: int) -> TrainingSettings:
+        """The same, with so many threads on a CPU where the configuration leaves that open."""
+        return self.model_copy(update={"threads": self.threads or threads})
+
+    def content(self) -> dict[str, Any]:
+        """What the weights follow from: all but how long and where the work is done."""
+        left_out = ("epochs", "hours", "threads", "loader_workers", "checkpoint_minutes", "device")
+        return self.model_dump(exclude=set(left_out))
+
+
 log = logging.getLogger("stereotruth")
-
-
 FORMAT = 1  # of the state
 BETAS = (0.9, 0.999)
 
@@ -62,11 +78,6 @@ def read_state(path: Path, key: str) -> dict[str, Any] | None:
         log.info("settings or data are others than before: the training starts anew")
         return None
     return record
-
-
-def learning_rate_of(training: TrainingSettings, epoch: int) -> float:
-    """Of an epoch: halved every ``halve_every_epochs``."""
-    return training.learning_rate * 0.5 ** (epoch // training.halve_every_epochs)
 
 
 def freeze_parts(network: nn.Module, frozen: Sequence[str]) -> list[nn.Module]:

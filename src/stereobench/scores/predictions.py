@@ -41,7 +41,7 @@ from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 from ..methods.kinds import FOLDER, MOVED, TOLD
 from ..methods.matcher import BatchMatcher, ImagePair, Matched, Matcher, UncertainMatcher
 from ..methods.methods import make_method
-from ..methods.result_files import SUFFIXES, read_result
+from ..methods.user_methods import SUFFIXES, read_result
 from .identity import identity, machine
 from .prediction_files import RECORD, UNCERTAINTY
 from .submission import SUBMITTED, Submission

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from stereocities.cities import CitySpec, SceneSpec
 from stereocities.render import prepare
-from stereocities.surfaces import ROOF, WALL
 from stereocities.truth import CHANGES, SURFACES, truth_at
 from stereocities.truth import LAYERS as OF_IMAGES
 
@@ -30,6 +29,7 @@ from ..epipolar.model import EpipolarModel
 
 CHUNK = 256
 SHARD = 1024
+BUILT = [SURFACES.split().index(kind) for kind in ("roof", "wall")]
 EDGE_PX = 1.0  # px of disparity between neighbours: more is a height edge
 FLAGS = {"surface": SURFACES, "changed": CHANGES, "edge": "none building other"}
 LAYERS = {
@@ -97,7 +97,7 @@ def truth_window(
         "visible": found["visible_right"],
         "hidden": found["hidden_right"],
         **{name: found[name] for name in ("changed", "changed_right", "covered", "surface")},
-        "edge": height_edges(disparity, (surface == ROOF) | (surface == WALL)),
+        "edge": height_edges(disparity, np.isin(surface, BUILT)),
     }
     return {name: values[1:-1, 1:-1] for name, values in layers.items()}
 

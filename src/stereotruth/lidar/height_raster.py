@@ -1,7 +1,7 @@
 """Rasters of heights on the ground: where their cells lie, and what their heights count from.
 
 The one reader of surface models and elevation models, for LiDAR, scores and control points: values
-by :mod:`..core.products.raster_values`, systems by :mod:`.declared_crs`, datums by
+by :mod:`..core.products.rasters`, systems by :mod:`.declared_crs`, datums by
 :mod:`.to_wgs84`. Pixels that are points (AREA_OR_POINT) are the middles of their cells.
 
 Places are metres on the ground along the raster's columns and against its rows, from the centre of
@@ -397,7 +397,7 @@ def raster_header(file: Path) -> laspy.LasHeader:
 def sampled_heights(file: Path) -> tuple[float, float] | None:
     """Lowest and highest of some cells all over the raster, in its unit; None where all lack.
 
-    Of a raster of :data:`.raster_values.MOST_CELLS` at most, of all. Raises InputError for values
+    Of a raster of :data:`..core.products.rasters.MOST_CELLS` at most, of all. Raises InputError for values
     that are no heights.
     """
     with _opened(file) as (values, _):

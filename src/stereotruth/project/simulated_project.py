@@ -18,8 +18,7 @@ from stereocities.cities import (
 from stereocities.control_points import simulate_points
 from stereocities.lidar import simulate_lidar_tile
 from stereocities.render import simulate_image
-from stereocities.site_images import simulate_site_image, simulate_site_points
-from stereocities.sites import SiteSpec, images_drawn
+from stereocities.sites import SiteSpec, images_drawn, simulate_site_image, simulate_site_points
 from stereocities.twin_world import SUN_DEG, twin_city
 
 from ..core.errors import InputError

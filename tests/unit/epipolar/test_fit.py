@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereocities import site_images
+from stereocities import sites
 from stereocities.sites import drawn_site
 from stereotruth.core.errors import InputError
 from stereotruth.epipolar.fit import fit_epipolar
@@ -168,16 +168,16 @@ def test_a_huge_height_range() -> None:
 def test_small_images_with_a_wide_range_of_heights_keep_their_rows(monkeypatch) -> None:
     """Crops of 700 px whose RPCs cover 1200 m of height, of two passes: rows shrank to a tenth, or
     the model could not be inverted."""
-    monkeypatch.setattr(site_images, "RPC_MARGIN_M", 600.0)
-    site_images.camera_of.cache_clear()
+    monkeypatch.setattr(sites, "RPC_MARGIN_M", 600.0)
+    sites.camera_of.cache_clear()
     site = drawn_site(1, 4242, images=2, side_px=700, seasons=False)
     sensors, sizes = [], []
     for image in site.images:
-        seen = site_images.camera_of(site, image)
+        seen = sites.camera_of(site, image)
         values = dict(zip(SCALARS, seen.rpc.numbers)) | dict(zip(VECTORS, seen.rpc.coefficients))
         sensors.append(SensorModel(RPC(**values)))
         sizes.append((seen.cols, seen.rows))
-    site_images.camera_of.cache_clear()
+    sites.camera_of.cache_clear()
     model = fit_epipolar(*sensors, *sizes, sensors[0].rpc.height_off)
     for view in ("left", "right"):
         low, high = model.report[f"scale_{view}"]

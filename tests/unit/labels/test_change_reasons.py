@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereocities.changes import REASONS
+from stereocities.truth import REASONS
 from stereotruth.core.status import Reason, Status
 from stereotruth.labels.change_reasons import REASON_PX, VEHICLE_M, is_common, with_reasons
 from stereotruth.labels.image_agreement import Comparison

@@ -9,8 +9,7 @@ import pytest
 
 from stereocities.cities import Canopy, lidar_files
 from stereocities.lidar import simulate_lidar_tile
-from stereocities.site_images import image_truth
-from stereocities.sites import drawn_site
+from stereocities.sites import drawn_site, image_truth
 from stereocities.surfaces import TREE
 from stereotruth.align.aligned_pair import ViewFit
 from stereotruth.core.errors import InputError

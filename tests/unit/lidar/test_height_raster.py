@@ -54,7 +54,7 @@ def test_cells_become_points_in_their_middles(tmp_path, monkeypatch, profile):
     assert surveyed.heights[0] == pytest.approx(20, abs=1) and surveyed.heights[1] <= 60
     assert list(surveyed.notes) == found["notes"]
     # whatever is read at once
-    monkeypatch.setattr(raster_values, "MOST_CELLS", 1)
+    monkeypatch.setattr(rasters, "MOST_CELLS", 1)
     ingest(file, tmp_path / "b.points")
     assert tree_digest(tmp_path / "b.points") == tree_digest(tmp_path / "a.points")
 

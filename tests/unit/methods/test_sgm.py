@@ -12,7 +12,6 @@ from stereobench.methods.sgm import (
     GreyMapping,
     SemiGlobalMatcher,
     grey_mapping,
-    peak_ratio,
     to_8_bits,
 )
 from stereotruth.core.errors import InputError
@@ -30,46 +29,36 @@ def pair(shift: int, dtype=np.uint16, seed=0):
     return left.astype(dtype), right.astype(dtype)
 
 
-def inside(shift: int):
-    """Columns of the left image whose match lies in the right one."""
-    match = np.arange(W) - shift
-    return (match >= 0) & (match < W)
-
-
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("shift", [-21, 0, 34])
-def test_a_shift_is_found_in_every_column_that_both_images_show(mode, shift):
-    found = SemiGlobalMatcher(mode=mode)(*pair(shift), (-32, 48))
-    assert found.shape == (H, W) and found.dtype == np.float32
-    seen = inside(shift)
-    if (~seen).any():
+def test_a_shift_is_found_in_every_column_that_both_images_show(mode):
+    for shift in (-21, 34):
+        found = SemiGlobalMatcher(mode=mode)(*pair(shift), (-32, 48))
+        assert found.shape == (H, W) and found.dtype == np.float32
+        match = np.arange(W) - shift
+        seen = (match >= 0) & (match < W)
         assert np.isnan(found[:, ~seen]).mean() > 0.98
-    good = found[:, seen]
-    assert np.isfinite(good).mean() > 0.98
-    assert np.nanmax(np.abs(good - shift)) <= 1.25  # by the padding, next to it
-    assert np.nanmax(np.abs(good[3:-3, 3:-3] - shift)) <= 0.25
-    assert abs(np.nanmean(good) - shift) < 0.02
+        good = found[:, seen]
+        assert np.isfinite(good).mean() > 0.98
+        assert np.nanmax(np.abs(good - shift)) <= 1.25  # by the padding, next to it
+        assert np.nanmax(np.abs(good[3:-3, 3:-3] - shift)) <= 0.25
+        assert abs(np.nanmean(good) - shift) < 0.02
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_all_depths_give_the_same(dtype):
+def test_all_depths_colour_and_threads_give_the_same(dtype):
     left, right = pair(5, dtype)
-    found = SemiGlobalMatcher()(left, right, (-16, 16))
+    before = cv2.getNumThreads()
+    found = SemiGlobalMatcher(workers=2)(left, right, (-16, 16))
+    assert cv2.getNumThreads() == before
     assert np.isfinite(found[:, 8:]).mean() > 0.98
     assert np.nanmax(np.abs(found[3:-3, 8:-3] - 5)) <= 0.25
-
-
-def test_colour_is_matched_as_grey():
-    left, right = (np.repeat(image[..., None], 3, axis=2) for image in pair(5, np.uint8))
-    grey = SemiGlobalMatcher()(left[..., 0].copy(), right[..., 0].copy(), (-16, 16))
-    assert np.array_equal(SemiGlobalMatcher()(left, right, (-16, 16)), grey, equal_nan=True)
-
-
-def test_results_outside_the_range_are_invalid():
-    """OpenCV looks through a multiple of 16 px, 0 to 31 here."""
-    found = SemiGlobalMatcher()(*pair(25), (0, 20))
-    assert np.isnan(found).mean() > 0.9
-    assert not (found >= 20).any() and not (found < 0).any()
+    if dtype == np.uint8:
+        left, right = (np.repeat(image[..., None], 3, axis=2) for image in (left, right))
+        again = SemiGlobalMatcher()(left, right, (-16, 16))
+    else:  # parts of an image share its mapping
+        matcher = SemiGlobalMatcher()
+        again = matcher(left, right, (-16, 16), matcher.scaling(left, right))
+    assert np.array_equal(again, found, equal_nan=True)
 
 
 def test_nodata_of_either_image_is_invalid():
@@ -84,23 +73,25 @@ def test_nodata_of_either_image_is_invalid():
     assert np.isfinite(found[30:50, 110:]).mean() > 0.9
 
 
-@pytest.mark.parametrize("limits", [(-32, 48), (-48, -16), (16, 48)])
+@pytest.mark.parametrize("limits", [(-32, 48), (-48, -16), (0, 20)])
 def test_it_is_a_bare_call_on_padded_images(limits):
+    """OpenCV looks through a multiple of 16 px; results outside the range are invalid."""
     matcher = SemiGlobalMatcher(speckle_px=0)
     left, right = pair(3)
     low, high = limits
     mapping = matcher.scaling(left, right)
-    before, after = max(high, 0), max(-low, 0)
+    bare = matcher.opencv(limits)
+    before, after = max(low + bare.getNumDisparities(), 0), max(-low, 0)
     padded = [
         cv2.copyMakeBorder(to_8_bits(i, mapping), 0, 0, before, after, cv2.BORDER_REPLICATE)
         for i in (left, right)
     ]
-    bare = matcher.opencv(limits).compute(*padded)[:, before : before + W] / 16
+    bare = bare.compute(*padded)[:, before : before + W] / 16
     found = matcher(left, right, limits)
     known = np.isfinite(found)
     assert np.array_equal(found[known], bare[known])
     match = np.arange(W) - np.floor(bare + 0.5)
-    outside = (bare < low) | (match < 0) | (match >= W)
+    outside = (bare < low) | (bare >= high) | (match < 0) | (match >= W)
     assert np.array_equal(known, ~outside)
 
 
@@ -116,11 +107,9 @@ def test_the_grey_mapping_is_monotone_and_clips_nothing():
     middle = levels[low : high + 1]
     assert middle[0] == 16 and middle[-1] == 239
     assert np.abs(np.diff(middle, 2)).max() <= 1  # linear, rounded
-    step = np.mean(np.diff(middle))
     assert levels[high + 5] > levels[high]  # the tails go on at the same slope ...
-    assert np.diff(levels[high : high + 20]).mean() < step  # ... and bend
-    real = mapping(np.arange(1 << 16, dtype=np.float32)[None])[0]
-    assert np.array_equal(real, levels)
+    assert np.diff(levels[high : high + 20]).mean() < np.mean(np.diff(middle))  # ... and bend
+    assert np.array_equal(mapping(np.arange(1 << 16, dtype=np.float32)[None])[0], levels)
 
 
 def test_both_images_have_one_mapping_whatever_the_array():
@@ -128,73 +117,33 @@ def test_both_images_have_one_mapping_whatever_the_array():
     right = (right * 1.5).astype(np.uint16)
     mapping = grey_mapping(left, right)
     assert mapping.low < np.percentile(left, 4) and mapping.high > np.percentile(right, 95)
-    lazy = grey_mapping(da.from_array(left, chunks=50), da.from_array(right, chunks=50))
-    assert lazy == mapping
+    assert grey_mapping(*(da.from_array(image, chunks=50) for image in (left, right))) == mapping
+    wider = (np.pad(image, ((0, 300), (0, 0))) for image in (left, right))  # nodata
+    assert grey_mapping(*wider) == mapping
     assert grey_mapping(left.astype(np.uint8), right.astype(np.uint8)) is None
     assert grey_mapping(np.zeros_like(left), np.zeros_like(right)) == GreyMapping(0.0, 1.0)
 
 
-def test_nodata_does_not_enter_the_mapping():
-    left, right = pair(5)
-    mapping = grey_mapping(left, right)
-    left, right = (np.pad(image, ((0, 300), (0, 0))) for image in (left, right))
-    assert grey_mapping(left, right) == mapping
-
-
-def test_parts_of_an_image_share_its_mapping():
-    left, right = pair(5)
-    matcher = SemiGlobalMatcher()
-    scaling = matcher.scaling(left, right)
-    whole = matcher(left, right, (-16, 16))
-    assert np.array_equal(matcher(left, right, (-16, 16), scaling), whole, equal_nan=True)
-
-
-def test_threads_change_nothing_and_stay_as_they_were():
-    left, right = pair(7)
-    before = cv2.getNumThreads()
-    one, two = (SemiGlobalMatcher(workers=n)(left, right, (-16, 16)) for n in (1, 2))
-    assert np.array_equal(one, two, equal_nan=True)
-    assert cv2.getNumThreads() == before
-
-
 @pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"mode": "full"}, "no mode 'full'"),
-        ({"block_size": 4}, "4 px is not odd"),
-        ({"p1": 50, "p2": 40}, "not 0 < p1 < p2"),
-    ],
+    "settings", [{"mode": "full"}, {"block_size": 4}, {"p1": 50, "p2": 40}, {"uncertainty": "no"}]
 )
-def test_settings_that_cannot_work_are_refused(settings, words):
-    with pytest.raises(InputError, match=words):
+def test_settings_that_cannot_work_are_refused(settings):
+    with pytest.raises(InputError):
         SemiGlobalMatcher(**settings)
-
-
-def test_the_left_right_check_can_be_switched_off():
-    left, right = pair(7)
-    right[20:40, 60:100] = pair(7, seed=5)[1][20:40, 60:100]
-    checked, not_checked = (
-        SemiGlobalMatcher(left_right_px=px, speckle_px=0, uniqueness_percent=0)(
-            left, right, (-16, 16)
-        )
-        for px in (1, None)
-    )
-    assert np.isnan(not_checked).sum() < np.isnan(checked).sum()
-
-
-def spoilt():
-    """A pair of shift 5 of which a patch of the right image shows something else."""
-    left, right = pair(5)
-    right[20:40, 60:100] = pair(5, seed=8)[1][20:40, 60:100]
-    return left, right
 
 
 @pytest.mark.parametrize("kind", ["left_right", "peak_ratio"])
 def test_uncertainties_are_larger_where_the_images_differ(kind):
+    left, right = pair(5)
+    right[20:40, 60:100] = pair(5, seed=8)[1][20:40, 60:100]
     loose = {"left_right_px": None, "speckle_px": 0, "uniqueness_percent": 0}
+    plain = SemiGlobalMatcher(**loose)
     matcher = SemiGlobalMatcher(uncertainty=kind, **loose)
-    found, sigma = matcher.with_uncertainty(*spoilt(), (-16, 16))
-    assert np.array_equal(found, SemiGlobalMatcher(**loose)(*spoilt(), (-16, 16)), equal_nan=True)
+    found, sigma = matcher.with_uncertainty(left, right, (-16, 16))
+    assert np.array_equal(found, plain(left, right, (-16, 16)), equal_nan=True)
+    assert plain.with_uncertainty(left, right, (-16, 16))[1] is None
+    checked = SemiGlobalMatcher(speckle_px=0, uniqueness_percent=0)(left, right, (-16, 16))
+    assert np.isnan(found).sum() < np.isnan(checked).sum()  # by the left-right check
     assert sigma.dtype == np.float32 and np.nanmin(sigma) >= 0
     assert np.isnan(sigma[np.isnan(found)]).all()
     assert np.isfinite(sigma[np.isfinite(found)]).mean() > 0.9
@@ -202,20 +151,3 @@ def test_uncertainties_are_larger_where_the_images_differ(kind):
     assert np.nanmedian(bad) > 3 * np.nanmedian(good)
     if kind == "left_right":
         assert np.nanmedian(good) < 0.1
-
-
-def test_without_being_asked_for_there_is_no_uncertainty():
-    assert SemiGlobalMatcher().with_uncertainty(*pair(5), (-16, 16))[1] is None
-    with pytest.raises(InputError, match="SGM has no uncertainty 'entropy'"):
-        SemiGlobalMatcher(uncertainty="entropy")
-
-
-@pytest.mark.parametrize("limits", [(-16, 16), (-40, -8), (4, 36)])
-def test_the_peak_ratio_of_a_shift_is_small_in_any_range(limits):
-    shift = sum(limits) // 2 + 2
-    left, right = pair(shift, np.uint8)
-    found = np.full((H, W), shift, np.float32)
-    ratio = peak_ratio(found, left, right, limits)[5:-5]
-    seen = inside(shift) & inside(shift + 8) & inside(shift - 8)
-    assert np.median(ratio[:, seen]) < 0.2
-    assert np.median(peak_ratio(found + 4, left, right, limits)[5:-5][:, seen]) == 1

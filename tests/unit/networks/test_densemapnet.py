@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: make test-networks")
-from stereobench.networks import keras_weights
+from stereobench.networks import weights
 from stereobench.networks.weights import scaled
 
 from ...synthetic.keras_reference import REFERENCE, SHAPE, drawn_images, drawn_weights
@@ -33,7 +33,7 @@ def written_as_keras(path: Path) -> None:
 def test_results_are_those_of_the_authors_code(tmp_path: Path) -> None:
     """Keras' weights, by their order, give the authors' result under TensorFlow within 1e-4 px."""
     written_as_keras(tmp_path / "drawn.h5")
-    model, network = keras_weights.read_keras(tmp_path / "drawn.h5", "densemapnet")
+    model, network = weights.read_keras(tmp_path / "drawn.h5", "densemapnet")
     assert (model.channels, model.scaling) == (3, "dfc2019")
     left, right = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in drawn_images())
     with torch.no_grad():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from stereocities.site_images import simulate_site_image
+from stereocities.sites import simulate_site_image
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.project.check import check_project

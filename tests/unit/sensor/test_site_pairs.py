@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from stereocities.camera import rays
-from stereocities.site_images import camera_of
-from stereocities.sites import drawn_site
+from stereocities.sites import camera_of, drawn_site
 from stereotruth.core.numerics.geometry import DEGREE_M
 from stereotruth.sensor.rpc import RPC, SensorModel
 from stereotruth.sensor.site_pairs import SiteImage, angles_of, pair_of, pairs_of_site

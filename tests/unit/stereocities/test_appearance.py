@@ -12,27 +12,8 @@ from stereocities.cities import ViewSpec
 from stereocities.render import _shade_rows, prepare
 from stereocities.surfaces import direction_of_sun
 
-from ...synthetic.small_cities import GROUND, ONE_BOX, TREE
-from ...synthetic.wooded_cities import CANOPY, OPEN, shown_by
-
-
-def test_dark_crowns_are_dark_by_the_factor() -> None:
-    bright, dark = (
-        replace(OPEN, character=replace(OPEN.character, canopy=replace(CANOPY, brightness=b)))
-        for b in (1.0, 0.5)
-    )
-    shown = shown_by(OPEN, "left", 1.0)
-    at = np.rint(np.column_stack([shown["row"], shown["col"]])).astype(int)
-    values = []
-    for city in (bright, dark):
-        camera = prepare(city, city.scenes[0]).left
-        half = np.empty((2 * camera.rows, 2 * (camera.cols + 4)), np.float32)
-        _shade_rows(camera.surfaces, camera.horizon, camera.shown, camera.cam, 0.0, half)
-        values.append(half[2 * at[:, 0], 2 * at[:, 1] + 4])
-    ratio = values[1] / values[0]
-    tree, ground = shown["surface"] == TREE, shown["surface"] == GROUND
-    assert np.median(ratio[tree]) == pytest.approx(0.5, abs=0.01)
-    assert np.median(ratio[ground]) == 1.0
+from ...synthetic.small_cities import GROUND, ONE_BOX
+from ...synthetic.wooded_cities import shown_by
 
 
 def test_shadows_of_a_view_fall_away_from_its_own_sun() -> None:

@@ -8,14 +8,22 @@ import numpy as np
 import pytest
 
 from stereocities import layout
-from stereocities.built_city import surfaces_of
-from stereocities.cities import CITIES, CitySpec, lidar_files
+from stereocities.cities import (
+    APART_DEG,
+    CITIES,
+    CitySpec,
+    cities_for,
+    lidar_files,
+    training_city,
+)
 from stereocities.control_points import make_points
 from stereocities.surfaces import IN_IMAGES, IN_LIDAR
+from stereocities.world import surfaces_of
 
 from ...synthetic.small_cities import ROOT, read_points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("city", CITIES.values(), ids=list(CITIES))
 def test_committed_gcps_and_what_each_city_must_have(city: CitySpec) -> None:
     surfaces = surfaces_of(city)
@@ -42,3 +50,25 @@ def test_committed_gcps_and_what_each_city_must_have(city: CitySpec) -> None:
         # spread over the scene: a point in each quarter, and none bunched
         assert len({(c > 0.5, r > 0.5) for c, r in at}) == 4
         assert np.linalg.norm(np.ptp(at, axis=0)) > 1.1
+
+
+def test_no_test_shows_one_of_them():
+    assert training_city(3, 7, 900) == training_city(3, 7, 900) != training_city(3, 8, 900)
+    shown = {city.world_seed for city in CITIES.values()}
+    poses = {scene.pose_seed for city in CITIES.values() for scene in city.scenes}
+    drawn = [training_city(number, 1, 900) for number in range(300)]
+    assert len({city.world_seed for city in drawn}) == 300
+    for city in drawn:
+        assert city.world_seed not in shown and city.scenes[0].pose_seed not in poses
+        for other in CITIES.values():
+            assert max(abs(city.lon - other.lon), abs(city.lat - other.lat)) > APART_DEG
+
+
+def test_cities_that_validate_do_not_train_and_larger_sets_hold_smaller_ones():
+    sets = {count: cities_for(count) for count in (5, 19, 76, 300)}
+    for count, (training, validation) in sets.items():
+        assert 4 * len(training) >= count > 4 * (len(training) - 1)
+        assert len(validation) == max(1, round(count / 40))
+        for other, _ in sets.values():
+            assert not set(validation) & set(other)
+    assert sets[300][0][:5] == sets[19][0]

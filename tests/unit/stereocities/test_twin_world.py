@@ -10,26 +10,22 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereocities.built_city import surfaces_of, top_surface
 from stereocities.camera import rays
-from stereocities.changes import BUILT, DEMOLISHED, changes_at
 from stereocities.cities import Dates, FlightStrip, Jitter, ViewSpec, read_city, write_city
-from stereocities.dated_worlds import YOUNG
 from stereocities.lidar import simulate_lidar_tile
-from stereocities.patches import PATCH_M, PATCHES_A_CELL
 from stereocities.render import prepare
 from stereocities.surfaces import (
-    CELL_M,
     GROUND,
-    IN_IMAGES,
-    IN_LIDAR,
+    PATCH_M,
+    PATCHES_A_CELL,
     ROOF,
     TREE,
     WALL,
     terrain_heights,
 )
-from stereocities.truth import truth_at
+from stereocities.truth import BUILT, DEMOLISHED, changes_at, truth_at
 from stereocities.twin_world import twin_city
+from stereocities.world import top_surface
 from stereotruth.core.errors import InputError
 
 from ...synthetic import house_points as place
@@ -45,10 +41,6 @@ def geodetic(x, y):
     return to.transform(place.ORIGIN[0] + x, place.ORIGIN[1] + y)
 
 
-def test_cells_hold_whole_patches():
-    assert PATCHES_A_CELL * PATCH_M == CELL_M
-
-
 def test_ground_and_roofs_are_those_of_the_house(house):
     """At a metre from walls: the height of the planes, to a tenth of the points' spacing."""
     x, y = np.meshgrid(np.arange(-58.0, 59.0, 1.3), np.arange(-58.0, 59.0, 1.3))
@@ -61,6 +53,9 @@ def test_ground_and_roofs_are_those_of_the_house(house):
     error = (height - true)[clear]
     assert np.abs(error).max() < 0.08 and abs(error.mean()) < 0.01
     assert (kind[clear] == np.where(true[clear] > place.GROUND_Z, ROOF, GROUND)).all()
+    for middle, _, top in place.TREES:
+        height, kind = top_surface(house, *geodetic(*(np.array([v]) for v in middle)))
+        assert kind[0] == TREE and top - 2.0 < height[0] < top + 0.3
 
 
 def test_walls_stand_where_the_house_ends(house):
@@ -75,12 +70,6 @@ def test_walls_stand_where_the_house_ends(house):
             high = top_surface(house, *geodetic(*at))[0] > place.GROUND_Z + 4
             edge = out[0] + step * high.sum(axis=1)
             assert np.abs(edge - half).max() < 0.6 and abs(edge.mean() - half) < 0.25
-
-
-def test_crowns_stand_where_points_of_leaves_are(house):
-    for middle, _, top in place.TREES:
-        height, kind = top_surface(house, *geodetic(*(np.array([v]) for v in middle)))
-        assert kind[0] == TREE and top - 2.0 < height[0] < top + 0.3
 
 
 def solid_height(s, x, y):
@@ -131,11 +120,10 @@ def test_the_lidar_of_a_twin_lies_on_it(house, tmp_path):
     assert off.std() == pytest.approx(0.03, abs=0.015) and abs(off.mean()) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "days", "reason", "changed"),
     [
-        ("built", (9.0, 9.0, 0.0), BUILT, 2),
-        ("demolished", (9.0, 9.0, 0.0), DEMOLISHED, 1),
         ("raised", (9.0, 9.0, 0.0), BUILT, 2),
         ("demolished", (0.0, 9.0, 0.0), DEMOLISHED, 0),
     ],
@@ -158,32 +146,19 @@ def test_buildings_of_a_twin_have_their_dates(house, share, days, reason, change
         assert not (truth["visible_right"] | truth["hidden_right"])[roofs].any()
 
 
-def test_trees_of_a_twin_are_felled_whole(house):
-    felled = surfaces_of(replace(house, dates=Dates(9.0, 9.0, 0.0, felled=1.0)))
-    assert (felled.tree_view == IN_LIDAR).all() and len(felled.trees) > 50
-    grown = surfaces_of(replace(house, dates=Dates(9.0, 9.0, 0.0, grown=1.0)))
-    young, old = (grown.trees[grown.tree_view == bits] for bits in (IN_LIDAR, IN_IMAGES))
-    base = place.GROUND_Z - house.base_height_m
-    np.testing.assert_allclose(young[:, 2] - base, YOUNG * (old[:, 2] - base), atol=0.1)
-
-
-def test_a_file_without_coordinate_system_is_refused(tmp_path):
+def test_files_that_no_twin_can_be_made_of_are_refused(tmp_path):
     file = place.write_place(tmp_path / "none.laz", crs=False)
-    with pytest.raises(InputError, match=r"none\.laz.*no coordinate system.*--crs EPSG"):
-        twin_city("None", file)
     given = twin_city("None", file, crs="EPSG:32631")
     assert given.twin.half_m == pytest.approx((place.HALF_M, place.HALF_M), abs=0.5)
-    with pytest.raises(InputError, match="is no coordinate system"):
-        twin_city("None", file, crs="EPSG:1")
-    with pytest.raises(InputError, match="lies outside of what"):
-        twin_city("None", file, crs="EPSG:4326")
-    with pytest.raises(InputError, match=r"would be 4000 x 300 px.*as --size"):
-        twin_city("None", file, crs="EPSG:32631", size_px=(4000, 300))
     (tmp_path / "no.laz").write_text("no points")
-    with pytest.raises(InputError, match="cannot be read as LAS"):
-        twin_city("None", tmp_path / "no.laz")
-    with pytest.raises(InputError, match="no such file"):
-        twin_city("None", tmp_path / "away.laz")
+    for name, more in {
+        "none.laz": ({}, {"crs": "EPSG:1"}, {"crs": "EPSG:4326"}),
+        "no.laz": ({},),
+        "away.laz": ({},),
+    }.items():
+        for settings in (*more, {"crs": "EPSG:32631", "size_px": (4000, 300)}):
+            with pytest.raises(InputError, match=rf"{name}.*Remedy"):
+                twin_city("None", tmp_path / name, **settings)
 
 
 def test_a_city_comes_back_from_its_file(house, tmp_path):
@@ -202,5 +177,5 @@ def test_a_city_comes_back_from_its_file(house, tmp_path):
         dates=Dates(9.0, 9.0, 0.0, felled=0.2),
     )
     (tmp_path / "city.json").write_text('{"name": "A"}')
-    with pytest.raises(InputError, match="lon: Field required"):
+    with pytest.raises(InputError, match="lon"):
         read_city(tmp_path / "city.json")

@@ -1,11 +1,11 @@
-"""A stereo method over the rectified images of a whole scene, in blocks that outlive their job.
+"""A stereo method over the rectified images of a whole scene, in tiles that outlive their job.
 
-Work goes in two rounds over the grid, both kept as :mod:`stereotruth.core.products.resumable_grids`
-keeps blocks: the method makes the tiles (:mod:`stereobench.methods.scenes.tiling`), side by
-side in a grid of their own, one to a file; then the blocks are blended from the tiles that reach
-into them. Memory is that of the tiles at work. A job that was killed goes on with the tiles that
-lack; the result has the same bytes for any number of workers and kills, as far as the method itself
-gives the same for the same tile (SGM does; PyTorch does on one machine).
+The method makes the tiles (:mod:`.tiling`), side by side in a grid of their own, one to a file,
+kept as :mod:`stereotruth.core.products.resumable_grids` keeps blocks until the scene is whole; then
+the blocks of the scene are blended from the tiles that reach into them. Memory is that of the tiles
+at work. A job that was killed goes on with the tiles that lack; the result has the same bytes for
+any number of workers and kills, as far as the method itself gives the same for the same tile (SGM
+does; PyTorch does on one machine).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import dask.array as da
 import dask.threaded
 import numpy as np
 import zarr
@@ -30,11 +31,10 @@ from stereotruth.core.products.grids import Layer, require_complete
 from stereotruth.core.products.provenance import describe, digest, file_sha256
 from stereotruth.core.products.resumable_grids import BlockStore, resumable_grid
 
-from ..kinds import kind_of, names_of
-from ..matcher import Matcher
-from ..methods import make_method
-from .offsets import Offsets, find_offsets
-from .tiling import Tiling, blend, inside, predict_tile, view_of
+from .kinds import kind_of, names_of
+from .matcher import Matcher
+from .methods import make_method
+from .tiling import Offsets, Tiling, blend, find_offsets, predict_tile
 
 log = logging.getLogger("stereotruth")
 DisparityRange = tuple[int, int]
@@ -53,15 +53,6 @@ LAYERS = {
         },
     )
 }
-
-
-def identity(entry: Mapping[str, Any], files: Sequence[Path]) -> str:
-    """Digest of a method's configuration entry and of its files' content."""
-    return digest({"settings": dict(entry), "files": [file_sha256(path) for path in files]})
-
-
-def _image_content(attrs: Mapping[str, Any]) -> str:
-    return attrs.get("content") or digest(dict(attrs.get("provenance", {})))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,21 +90,15 @@ class _ImagePair:
 
     def tile(self, out: BlockStore, key: str, place: Place, offset: int) -> None:
         """Predict one tile and write it to its place in the grid of tiles."""
-        window = self.tiling.tile_window(place)
-        matcher, shape = self.matcher, self.tiling.shape
-        margin = matcher.margin_px if self.margin is None else self.margin
-        view = view_of(shape, window, margin, self.disparity_range, offset)
-        left, right = self.images
         found = predict_tile(
-            matcher,
-            inside(left, view.left),
-            inside(right, view.right),
-            view,
+            self.matcher,
+            self.images,
             self.tiling,
             place,
             self.disparity_range,
             offset,
-            self.scaling,
+            margin_px=self.margin,
+            scaling=self.scaling,
         )
         arrays = {"disparity": found} if np.isfinite(found).any() else {}
         out.write(self._stored(place), key, arrays, None)
@@ -133,11 +118,6 @@ class _ImagePair:
     def _stored(self, place: Place) -> Window:
         side = self.tiling.side
         return tuple(slice(k * side, (k + 1) * side) for k in place)
-
-
-def _fixed(offset: Any, tiling: Tiling) -> Offsets:
-    offsets = np.full(tiling.count, int(offset), dtype=np.int64)
-    return Offsets(offsets, np.ones(tiling.count, np.bool_), 1.0, np.ones(tiling.count))
 
 
 def _search(attrs: Mapping[str, Any]) -> DisparityRange | None:
@@ -211,28 +191,37 @@ def predict_scene(
         margin=settings.margin_px,
     )
     moved = _offsets(start, settings, left_attrs)
-    job = replace(start, scaling=start.matcher.scaling(*_lazy(*start.images)))
+    scaling = start.matcher.scaling(*map(da.from_zarr, start.images))
+    job = replace(start, scaling=scaling)
     parameters = _parameters(job, settings)
     files = [file for file in kind.files(entry) if file.is_file()]
+    made_of = {
+        name: digest(dict(attrs.get("provenance", {})))
+        for name, attrs in (("left", left_attrs), ("right", right_attrs))
+    }
     content = digest(
         {
-            "images": [_image_content(attrs) for attrs in (left_attrs, right_attrs)],
-            "method": identity(entry, files),
+            "images": [
+                attrs.get("content") or made_of[name]
+                for name, attrs in (("left", left_attrs), ("right", right_attrs))
+            ],
+            "method": digest(
+                {"settings": dict(entry), "files": [file_sha256(path) for path in files]}
+            ),
             "range": parameters["disparity_range"],
             "margin": parameters["margin_px"],
             "tiling": [settings.block_px, settings.overlap_px],
             "code": code,
         }
     )
-    plan = _Plan.of(job.tiling, content, moved)
+    windows = [job.tiling.block_window(place) for place in job.tiling.places()]
     with resumable_grid(out, shape, LAYERS, chunk=CHUNK, shard=settings.block_px) as unfinished:
-        tiles = _make_blocks(job, plan, unfinished, out, (scheduler, workers))
-        summary = _summary(unfinished.results(plan.windows), shape, moved)
-        inputs = {
-            name: digest(dict(attrs.get("provenance", {})))
-            for name, attrs in (("left", left_attrs), ("right", right_attrs))
-        }
-        inputs |= {name: file_sha256(path) for name, path in names_of(files).items()}
+        tiles = out.with_name(f"{out.name}.tiles")
+        folder = _make_blocks(
+            job, content, moved.offsets, (unfinished, tiles), (scheduler, workers)
+        )
+        summary = _summary(unfinished.results(windows), shape, moved)
+        inputs = made_of | {name: file_sha256(path) for name, path in names_of(files).items()}
         attrs = {
             "kind": "prediction",
             "scene": scene,
@@ -243,8 +232,8 @@ def predict_scene(
             "summary": summary,
             "provenance": describe(inputs, parameters, code),
         }
-        unfinished.write_atomically(out, plan.windows, attrs)
-        shutil.rmtree(tiles.folder, ignore_errors=True)
+        unfinished.write_atomically(out, windows, attrs)
+        shutil.rmtree(folder, ignore_errors=True)
     log.info(
         "%s: %.1f %% of the grid has a disparity, %.0f to %.0f px",
         method,
@@ -255,36 +244,11 @@ def predict_scene(
     return summary
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Blocks of a scene and the tiles that they are blended from, with the keys of both.
-
-    ``offsets``: of the right image, px, by place; ``keys`` and ``windows`` go with ``places``.
-    """
-
-    tiling: Tiling
-    offsets: NDArray[np.int64]
-    places: list[Place]
-    windows: list[Window]
-    keys: list[str]
-    tile_keys: dict[Place, str]
-
-    @classmethod
-    def of(cls, tiling: Tiling, content: str, moved: Offsets) -> _Plan:
-        """By a digest of all that the disparities follow from but the offsets."""
-        places = list(tiling.places())
-        tile_keys = {
-            p: digest({"content": content, "offset": int(moved.offsets[p])}) for p in places
-        }
-        keys = [digest({"tiles": [tile_keys[p] for p in tiling.around(q)]}) for q in places]
-        windows = [tiling.block_window(place) for place in places]
-        return cls(tiling, moved.offsets, places, windows, keys, tile_keys)
-
-
 def _offsets(pair: _ImagePair, settings: SceneMatching, attrs: Mapping[str, Any]) -> Offsets:
     """By how much the right image is moved for each block."""
     if settings.offset != "auto":
-        return _fixed(settings.offset, pair.tiling)
+        count = pair.tiling.count
+        return Offsets(np.full(count, settings.offset, np.int64), np.ones(count, np.bool_), 1.0)
     return find_offsets(*pair.images, pair.tiling, pair.disparity_range, _search(attrs))
 
 
@@ -302,44 +266,35 @@ def _parameters(job: _ImagePair, settings: SceneMatching) -> dict[str, Any]:
 
 
 def _make_blocks(
-    job: _ImagePair, plan: _Plan, blocks: BlockStore, out: Path, by: tuple[Any, int]
-) -> BlockStore:
-    """Make the blocks that are missing, and the tiles that these need; the store of the tiles.
+    job: _ImagePair,
+    content: str,
+    offsets: NDArray[np.int64],
+    to: tuple[BlockStore, Path],
+    by: tuple[Any, int],
+) -> Path:
+    """Make the tiles that are missing, and all blocks from them; the folder of the tiles.
 
-    ``by``: Dask's scheduler and its workers, which make one tile at a time if the method itself has
-    several threads.
+    ``content``: digest of all that the disparities follow from but the ``offsets`` [n, m], px.
+    ``to``: the store of the blocks, and the path of that of the tiles. ``by``: Dask's scheduler and
+    its workers, which make one tile at a time if the method itself has several threads.
     """
-    scheduler, workers = by
-    tiling, places = plan.tiling, plan.places
-    shape = tuple(n * tiling.side for n in tiling.count)
-    sizes = {"chunk": tiling.side, "shard": tiling.side}
-    missing = blocks.missing(plan.windows, plan.keys, workers)
-    with resumable_grid(out.with_name(f"{out.name}.tiles"), shape, LAYERS, **sizes) as tiles:
-        wanted = sorted({p for k in missing for p in tiling.around(places[k])})
-        wanted_keys = [plan.tile_keys[p] for p in wanted]
-        stored = [job._stored(p) for p in wanted]
-        todo = [wanted[k] for k in tiles.missing(stored, wanted_keys, workers)]
+    (blocks, out), (scheduler, workers) = to, by
+    places = list(job.tiling.places())
+    keys = [digest({"content": content, "offset": int(offsets[place])}) for place in places]
+    side = job.tiling.side
+    shape = tuple(n * side for n in job.tiling.count)
+    with resumable_grid(out, shape, LAYERS, chunk=side, shard=side) as tiles:
+        missing = tiles.missing([job._stored(place) for place in places], keys, workers)
         _run(
             job.tile,
-            [(tiles, plan.tile_keys[p], p, int(plan.offsets[p])) for p in todo],
+            [(tiles, keys[k], places[k], int(offsets[places[k]])) for k in missing],
             f"tiles by {job.method}",
             scheduler,
             workers if job.threads == 1 else 1,
         )
-        _run(
-            job.block,
-            [(tiles, blocks, plan.keys[k], places[k]) for k in missing],
-            "blending",
-            scheduler,
-            workers,
-        )
-    return tiles
-
-
-def _lazy(*images: zarr.Array) -> list[Any]:
-    import dask.array as da
-
-    return [da.from_zarr(image) for image in images]
+        made = [(tiles, blocks, content, place) for place in places]
+        _run(job.block, made, "blending", scheduler, workers)
+    return tiles.folder
 
 
 def _summary(results: Sequence[Sequence[Any]], shape: tuple[int, int], moved: Offsets) -> dict:

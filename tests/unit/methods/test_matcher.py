@@ -24,4 +24,3 @@ def test_holes_of_either_do_not_count():
     sigma = spread(first, second)
     assert np.isnan(sigma[[0, 7], [0, 7]]).all() and np.isnan(sigma).sum() == 2
     assert sigma[3, 3] == pytest.approx(1) and np.nanmax(np.abs(sigma - 1)) < 1e-6
-    assert np.isnan(spread(first, np.full_like(first, np.nan))).all()

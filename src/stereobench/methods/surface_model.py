@@ -64,9 +64,7 @@ def _triangle(a: Three, b: Three, c: Three, out: NDArray[np.float32]) -> None:
     x, y, z = (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[2], b[2], c[2])
     top = max(math.ceil(min(y[0], y[1], y[2])), 0)
     bottom = min(math.floor(max(y[0], y[1], y[2])), out.shape[0] - 1)
-    left = max(math.ceil(min(x[0], x[1], x[2])), 0)
-    right = min(math.floor(max(x[0], x[1], x[2])), out.shape[1] - 1)
-    if top > bottom or left > right:
+    if top > bottom or max(x[0], x[1], x[2]) < 0 or min(x[0], x[1], x[2]) > out.shape[1] - 1:
         return
     along, down = plane_slopes(x, y, z)
     if not np.isfinite(along + down):
@@ -157,14 +155,6 @@ def gsd(sensor: SensorModel, size: tuple[int, int], height: float) -> float:
     return float(np.sqrt(sides[0] * sides[1]))
 
 
-def default_resolution(model: EpipolarModel) -> float:
-    """The coarser image's pixel on the ground, to two digits."""
-    sizes = (model.left_size, model.right_size)
-    pairs = zip((model.left, model.right), sizes)
-    coarse = max(gsd(sensor, size, model.reference_height) for sensor, size in pairs)
-    return float(f"{coarse:.2g}")
-
-
 def _outline(rows: tuple[float, float], cols: tuple[float, float], n: int = 9) -> Floats:
     """[2, n²] (row, col) over a window, its edges included."""
     mesh = np.meshgrid(np.linspace(*rows, n), np.linspace(*cols, n), indexing="ij")
@@ -198,8 +188,14 @@ def height_bounds(model: EpipolarModel, low: float, high: float) -> tuple[float,
 def raster_of(
     model: EpipolarModel, heights: tuple[float, float], resolution: float | None
 ) -> Raster:
-    """The grid over what the left epipolar grid shows at these heights, on whole multiples."""
-    resolution = resolution or default_resolution(model)
+    """The grid over what the left epipolar grid shows at these heights, on whole multiples.
+
+    ``resolution``: None: the coarser image's pixel on the ground, to two digits.
+    """
+    if not resolution:
+        images = (model.left, model.left_size), (model.right, model.right_size)
+        coarse = max(gsd(sensor, size, model.reference_height) for sensor, size in images)
+        resolution = float(f"{coarse:.2g}")
     y, x = _outline((0, model.shape[0] - 1), (0, model.shape[1] - 1), 17)
     ground = [model.epipolar_to_ground(x, y, h) for h in heights]
     lon, lat = (np.concatenate(axis) for axis in zip(*ground))

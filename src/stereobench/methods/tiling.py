@@ -1,12 +1,15 @@
-"""How a scene is cut into overlapping blocks, and the pieces of both images that a block sees.
-
-Disparities of one block of a scene, and the blending of neighbouring blocks.
+"""How a scene is cut into overlapping blocks, what each of them sees, and how they are blended.
 
 The left grid is cut into square blocks. A *tile* is what the method says of a block and of
 ``overlap`` px around it; for that it sees the images with the margins that it needs: ``margin_px``
 to all sides and, along the row, the disparity range. The right part is moved by a whole number of
 pixels, the tile's *offset*, so that a scene may have more relief than the method has range:
 ``d = offset + d_method``.
+
+The offset is found from the images alone: both are reduced by averaging, and semi-global matching
+over the whole search range tells the disparities of the reduced scene. The offset of a block is the
+whole number of px with which most of its values lie in the method's range, and of these the one
+nearest to their median: the tiles of a dataset, too, are cut with their mean disparity as offset.
 
 Where tiles overlap, their disparities are averaged with weights that fall smoothly from one to the
 other. By what two tiles differ on the whole, median by squares of ``CELL_PX`` (networks are off by
@@ -18,18 +21,25 @@ pixel is valid. Pixels that one of the images does not show are invalid.
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from ..matcher import Matcher
+from stereotruth.core.errors import InputError
+
+from .matcher import DisparityRange, Matcher
+from .sgm import SemiGlobalMatcher
+
+log = logging.getLogger("stereotruth")
 
 Place = tuple[int, int]
 Window = tuple[slice, slice]
-DisparityRange = tuple[int, int]
 
 
 BLOCK_PX = 1024
@@ -126,21 +136,6 @@ def view_of(
     )
 
 
-def inside(image: Any, window: Window) -> Any:
-    """The part of an image [h, w] or [h, w, bands] (NumPy, Dask, Zarr) that a window meets."""
-    rows, cols = window
-    return image[
-        max(rows.start, 0) : max(min(rows.stop, image.shape[0]), 0),
-        max(cols.start, 0) : max(min(cols.stop, image.shape[1]), 0),
-    ]
-
-
-def extent_of(weights: NDArray[np.float64]) -> slice | None:
-    """Where the weights are not 0."""
-    found = np.flatnonzero(weights > 0.0)
-    return slice(int(found[0]), int(found[-1]) + 1) if found.size else None
-
-
 Disparities = NDArray[np.float32]
 
 
@@ -149,15 +144,13 @@ LARGEST_BIAS_PX = 8.0  # between tiles; what differs by more on the whole is lef
 SAME_PX, OTHER_PX = 2.0, 4.0
 
 
-def _padded(part: Any, window: Window, shape: tuple[int, int]) -> NDArray[Any]:
-    """A part as :func:`.tiling.inside` gives it as the whole window, 0 beyond the image."""
-    part = np.asarray(part)
-    sizes = tuple(w.stop - w.start for w in window)
-    if part.shape[:2] == sizes:
-        return np.ascontiguousarray(part)
-    whole = np.zeros((*sizes, *part.shape[2:]), dtype=part.dtype)
-    at = tuple(slice(max(-w.start, 0), max(-w.start, 0) + n) for w, n in zip(window, part.shape))
-    whole[at] = part
+def _part(image: Any, window: Window) -> NDArray[Any]:
+    """A window of an image [h, w] or [h, w, bands] (NumPy, Dask, Zarr), 0 beyond it."""
+    part = np.asarray(image[tuple(slice(max(w.start, 0), max(w.stop, 0)) for w in window)])
+    whole = np.zeros((*(w.stop - w.start for w in window), *part.shape[2:]), part.dtype)
+    if part.size:
+        first = [max(-w.start, 0) for w in window]
+        whole[tuple(slice(k, k + n) for k, n in zip(first, part.shape))] = part
     return whole
 
 
@@ -168,21 +161,23 @@ def _shown(image: NDArray[Any]) -> NDArray[np.bool_]:
 
 def predict_tile(
     matcher: Matcher,
-    left: Any,
-    right: Any,
-    view: View,
+    images: tuple[Any, Any],
     tiling: Tiling,
     place: Place,
     disparity_range: DisparityRange,
     offset: int,
+    *,
+    margin_px: int | None = None,
     scaling: Any = None,
 ) -> Disparities:
     """The tile at a place, float32[side, side], NaN where invalid or beyond the grid.
 
-    ``left``, ``right``: the parts of the images that the ``view`` meets (:func:`.tiling.inside`).
+    ``images``: left and right one (NumPy, Dask, Zarr). ``margin_px``: None: that of the method.
     """
-    left = _padded(left, view.left, tiling.shape)
-    right = _padded(right, view.right, tiling.shape)
+    window = tiling.tile_window(place)
+    margin = matcher.margin_px if margin_px is None else margin_px
+    view = view_of(tiling.shape, window, margin, disparity_range, offset)
+    left, right = (_part(image, of) for image, of in zip(images, (view.left, view.right)))
     tile = np.full((tiling.side, tiling.side), np.nan, dtype=np.float32)
     shown = _shown(left)[view.inner]
     in_right = _shown(right)
@@ -195,7 +190,6 @@ def predict_tile(
         shown &= (there >= 0) & (there < right.shape[1])
     there = np.where(shown, there, 0).astype(np.intp)
     shown &= np.take_along_axis(in_right[view.inner[0]], there, axis=1)
-    window = tiling.tile_window(place)
     at = tuple(slice(max(-w.start, 0), max(-w.start, 0) + n) for w, n in zip(window, found.shape))
     tile[at] = np.where(shown, found + np.float32(offset), np.float32(np.nan))
     return tile
@@ -267,9 +261,10 @@ def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Dispariti
         for j, in_cols in _weights(tiling, 1, place[1]).items():
             if (i, j) == place:
                 continue
-            r, c = (extent_of(w) for w in (in_rows, in_cols))
-            if r is None or c is None:
+            reached = [np.flatnonzero(weights > 0.0) for weights in (in_rows, in_cols)]
+            if not all(map(len, reached)):
                 continue
+            r, c = (slice(int(at[0]), int(at[-1]) + 1) for at in reached)
             window = tuple(
                 slice(o.start + w.start, o.start + w.stop) for o, w in zip((rows, cols), (r, c))
             )
@@ -281,3 +276,144 @@ def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Dispariti
             weight = in_rows[r, None] * in_cols[None, c]
             change[r, c] += weight * (bias[at] + np.nan_to_num(same * rest))
     return (own + change).astype(np.float32)
+
+
+REDUCED_PX = 2048  # longest side of the reduced images
+MEDIAN = 5  # px, reduced
+MIN_VALUES = 9  # reduced pixels with a disparity that a block must have
+MIN_SHARE = 0.05  # of its reduced pixels that have an image
+RESERVE_PX = 8  # kept free at both ends of the range: what the reduced scene does not show
+NEARLY = 0.998  # of the most values in range are as good as most
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """Offsets of the blocks, int64[n, m] px.
+
+    ``known``: blocks [n, m] whose own images told it; others have that of the nearest known one.
+    ``in_range``: share of the known blocks' values that lie in the range of their block.
+    """
+
+    offsets: NDArray[np.int64]
+    known: NDArray[np.bool_]
+    in_range: float
+
+
+def reduced(image: Any, factor: int) -> NDArray[np.float32]:
+    """An image [h, w] or [h, w, 3] averaged over squares of ``factor`` px; 0 is nodata.
+
+    Squares with less than half of their pixels are nodata. Reads NumPy, Dask or Zarr by strips.
+    """
+    rows, cols = (-(-n // factor) for n in image.shape[:2])
+    out = np.zeros((rows, cols), dtype=np.float32)
+    step = max(1, 256 // factor)
+    for first in range(0, rows, step):
+        part = np.asarray(image[first * factor : (first + step) * factor]).astype(np.float32)
+        if part.ndim == 3:
+            part = part.mean(axis=2)
+        tall, broad = part.shape
+        pad = ((0, -tall % factor), (0, -broad % factor))
+        part = np.pad(part, pad)
+        cells = part.reshape(part.shape[0] // factor, factor, cols, factor)
+        total, count = cells.sum(axis=(1, 3)), (cells != 0).sum(axis=(1, 3))
+        good = 2 * count >= factor * factor
+        out[first : first + step] = np.where(good, total / np.maximum(count, 1), 0.0)
+    return out
+
+
+def coarse_disparity(
+    left: Any, right: Any, search: DisparityRange
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], int]:
+    """Disparity in px of the full images on the reduced left one, where it has data, its factor.
+
+    NaN where semi-global matching finds none.
+    """
+    longest = max(left.shape[:2])
+    factor = max(1, math.ceil(longest / REDUCED_PX), min(4, longest // 512))
+    small = [reduced(image, factor) for image in (left, right)]
+    bounds = math.floor(search[0] / factor), math.ceil(search[1] / factor) + 1
+    matcher = SemiGlobalMatcher(mode="sgbm", uniqueness_percent=10, speckle_px=50)
+    found = matcher(*small, bounds) * np.float32(factor)
+    known = np.isfinite(found)
+    # a median of the known values: the unknown ones on either side balance each other
+    low = ndimage.median_filter(np.where(known, found, -np.inf), MEDIAN)
+    high = ndimage.median_filter(np.where(known, found, np.inf), MEDIAN)
+    known &= np.isfinite(low) & np.isfinite(high)
+    smooth = np.full(found.shape, np.nan, dtype=np.float32)
+    smooth[known] = 0.5 * (low[known] + high[known])
+    return smooth, small[0] != 0, factor
+
+
+def best_offset(values: NDArray[Any], disparity_range: DisparityRange) -> tuple[int, float]:
+    """The offset for a block's disparities, px, and the share of them that it brings in range."""
+    values = np.sort(np.asarray(values, dtype=np.float64).ravel())
+    low, high = disparity_range
+    reserve = min(RESERVE_PX, (high - low) // 4)
+    tried = np.arange(math.floor(values[0]) - high, math.ceil(values[-1]) - low + 1)
+    inside = np.searchsorted(values, tried + high - reserve, "left")
+    inside -= np.searchsorted(values, tried + low + reserve, "left")
+    good = tried[inside >= NEARLY * inside.max()]
+    middle = np.median(values)
+    offset = int(good[np.argmin(np.abs(good - middle))])
+    share = np.mean((values >= offset + low) & (values < offset + high))
+    return offset, float(share)
+
+
+def find_offsets(
+    left: Any,
+    right: Any,
+    tiling: Tiling,
+    disparity_range: DisparityRange,
+    search: DisparityRange | None = None,
+) -> Offsets:
+    """Offsets of all blocks, from the images alone (NumPy, Dask or Zarr arrays; 0 is nodata).
+
+    ``search``: disparities that the scene may have, px; None: up to a quarter of the width to
+    either side. Raises InputError if the images nowhere match.
+    """
+    reach = left.shape[1] // 4
+    search = search or (-reach, reach)
+    coarse, imaged, factor = coarse_disparity(left, right, search)
+    offsets = np.zeros(tiling.count, dtype=np.int64)
+    known = np.zeros(tiling.count, dtype=np.bool_)
+    shares = np.full(tiling.count, np.nan)
+    count = hits = 0
+    for place in tiling.places():
+        window = tuple(
+            slice(max(w.start, 0) // factor, -(-min(w.stop, n) // factor))
+            for w, n in zip(tiling.tile_window(place), tiling.shape)
+        )
+        values = coarse[window]
+        values = values[np.isfinite(values)]
+        if values.size < max(MIN_VALUES, MIN_SHARE * imaged[window].sum()):
+            continue
+        offsets[place], shares[place] = best_offset(values, disparity_range)
+        known[place] = True
+        count += values.size
+        hits += round(shares[place] * values.size)
+    if not known.any():
+        raise InputError(
+            f"left and right image do not match anywhere between {search[0]} and {search[1]} px",
+            remedy="check that they are an epipolar pair of one scene, or give the offset",
+        )
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    found = Offsets(offsets[tuple(nearest)], known, hits / count)
+    log.info(
+        "offsets of the right image: %d to %d px in %d blocks; %.2f %% of the disparities of the "
+        "scene, reduced %d times, lie in range",
+        found.offsets.min(),
+        found.offsets.max(),
+        known.size,
+        100.0 * found.in_range,
+        factor,
+    )
+    poor = int((shares < 0.95).sum())
+    if poor:
+        log.warning(
+            "in %d of %d blocks more than 5 %% of the ground lies beyond the range of %d px: take "
+            "smaller blocks (predict.block_px) or a method with a wider range",
+            poor,
+            known.size,
+            disparity_range[1] - disparity_range[0],
+        )
+    return found

@@ -8,25 +8,21 @@ import numpy as np
 import pytest
 import rasterio
 
-from stereobench.methods.scenes import surface_model
-from stereobench.methods.scenes.surface_model import (
+from stereobench.methods import surface_model
+from stereobench.methods.surface_model import (
     Raster,
-    default_resolution,
     gsd,
     raster_of,
-    utm_epsg,
     write_dsm,
 )
 from stereotruth.core.errors import InputError
-from stereotruth.core.job import dask_scheduler
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
-from stereotruth.epipolar.intersection import intersect
 from stereotruth.epipolar.model import EpipolarModel
 
-from ....synthetic.cameras import HEIGHT
-from ....synthetic.flat_model import EPSG, SIZE, disparity_of, make_model, metres, plane
-from ....synthetic.other_programs import PROGRAMS
-from ....synthetic.stores import Killed
+from ...synthetic.cameras import HEIGHT
+from ...synthetic.flat_model import EPSG, SIZE, disparity_of, make_model, metres, plane
+from ...synthetic.other_programs import PROGRAMS
+from ...synthetic.stores import Killed
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +56,8 @@ def read(path: Path) -> tuple[np.ndarray, Raster, dict]:
 
 def test_the_model_of_a_plane_is_the_plane(model, of_plane, tmp_path):
     store = write_grid(tmp_path / "d.zarr", model, of_plane)
+    assert gsd(model.left, SIZE, HEIGHT) == pytest.approx(0.65, rel=2e-3)
+    assert raster_of(model, (HEIGHT, HEIGHT + 10), None).resolution == 0.8  # the coarser pixel
     summary = write_dsm(store, tmp_path / "dsm.tif", resolution_m=0.7)
     found, raster, tags = read(tmp_path / "dsm.tif")
     assert raster.epsg == EPSG == summary["epsg"]
@@ -80,19 +78,9 @@ def test_the_model_of_a_plane_is_the_plane(model, of_plane, tmp_path):
     assert not known[~shown & ((x < -near) | (y < -near))].any()
     assert tags["vertical_datum"] == "WGS 84 ellipsoid"
     assert tags["profile"]["nodata"] == -9999.0
-
-
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_every_program_opens_it(model, of_plane, tmp_path, program):
-    store = write_grid(tmp_path / "d.zarr", model, of_plane)
-    write_dsm(store, tmp_path / "dsm.tif", resolution_m=0.7)
-    _, raster, _ = read(tmp_path / "dsm.tif")
-    row, col = np.mgrid[: raster.shape[0], : raster.shape[1]].astype(float)
-    found = PROGRAMS[program](tmp_path / "dsm.tif")
-    assert found.dtype == np.float32 and found.shape == raster.shape
-    known = found != -9999
-    assert known.mean() > 0.5
-    assert np.abs(found - plane(*raster.ground(col, row)))[known].max() < 2e-3
+    for by_program in PROGRAMS.values():
+        values = by_program(tmp_path / "dsm.tif")
+        assert np.array_equal(np.where(values == -9999, np.nan, values), found, equal_nan=True)
 
 
 @pytest.mark.slow
@@ -162,81 +150,11 @@ def test_blocks_and_kills_leave_no_trace(model, of_plane, tmp_path, monkeypatch)
     assert len(before) == 2
     assert out.read_bytes() == (tmp_path / "fresh.tif").read_bytes()
     assert {p.name for p in tmp_path.iterdir()} == {"d.zarr", "fresh.tif", "dsm.tif"}
-    whole = read(out)[0]
-    monkeypatch.setattr(surface_model, "SHARD", 1024)
-    write_dsm(store, tmp_path / "one.tif")
-    at_once = read(tmp_path / "one.tif")[0]
-    assert np.array_equal(np.isfinite(whole), np.isfinite(at_once))
-    assert np.nanmax(np.abs(whole - at_once)) < 1e-4
-
-
-@pytest.mark.slow
-def test_one_wild_disparity_costs_no_more_than_its_place(model, of_plane, tmp_path, monkeypatch):
-    """It widens the window of every block; parts that cannot reach a block are left out."""
-    monkeypatch.setattr(surface_model, "CHUNK", 128)
-    monkeypatch.setattr(surface_model, "SHARD", 128)
-    monkeypatch.setattr(surface_model, "PART", 32)
-    pixels: list[int] = []
-
-    def counted(model, disparity, row=0, col=0):
-        pixels.append(disparity.size)
-        return intersect(model, disparity, row, col)
-
-    monkeypatch.setattr(surface_model, "intersect", counted)
-    wild = of_plane.copy()
-    wild[200, 200] += 700.0
-    found, work = {}, {}
-    for name, d in (("calm", of_plane), ("wild", wild)):
-        pixels.clear()
-        write_dsm(write_grid(tmp_path / f"{name}.zarr", model, d), tmp_path / f"{name}.tif")
-        found[name], work[name] = read(tmp_path / f"{name}.tif")[:2], sum(pixels)
-    assert work["wild"] < 1.25 * work["calm"]
-    monkeypatch.setattr(surface_model.SurfaceModel, "reaches", lambda *_: True)
-    pixels.clear()
-    write_dsm(tmp_path / "wild.zarr", tmp_path / "all.tif")
-    assert sum(pixels) > 1.5 * work["wild"]
-    every, raster, _ = read(tmp_path / "all.tif")
-    assert np.array_equal(every, found["wild"][0], equal_nan=True)
-    calm, place = found["calm"]
-    dr = round((raster.north - place.north) / place.resolution)
-    dc = round((place.west - raster.west) / place.resolution)
-    inside = every[dr : dr + calm.shape[0], dc : dc + calm.shape[1]]
-    assert np.isfinite(calm).sum() - np.isfinite(inside).sum() < 20  # the hole of the wild one
-    same = np.isfinite(calm) & np.isfinite(inside)
-    assert np.abs(calm - inside)[same].max() < 1e-4
-
-
-def test_workers_of_a_dask_cluster_write_the_same_bytes(model, of_plane, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="needs the extra `cluster`")
-    store = write_grid(tmp_path / "d.zarr", model, of_plane)
-    write_dsm(store, tmp_path / "fresh.tif")
-    options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None}
-    with (
-        distributed.LocalCluster(processes=False, protocol="tcp", **options) as cluster,
-        dask_scheduler(cluster.scheduler_address) as client,
-    ):
-        write_dsm(store, tmp_path / "other.tif", scheduler=client)
-    assert (tmp_path / "other.tif").read_bytes() == (tmp_path / "fresh.tif").read_bytes()
-
-
-def test_the_cell_is_the_coarser_pixel(model):
-    assert gsd(model.left, SIZE, HEIGHT) == pytest.approx(0.65, rel=2e-3)
-    assert default_resolution(model) == 0.8
-    raster = raster_of(model, (HEIGHT, HEIGHT + 10), None)
-    assert raster.resolution == default_resolution(model)
-
-
-@pytest.mark.parametrize(
-    ("lon", "lat", "epsg"),
-    [(114.3, 30.6, 32650), (-70.0, -33.0, 32719), (179.99, 10.0, 32660), (-180.0, -1.0, 32701)],
-)
-def test_zones_of_utm(lon, lat, epsg):
-    assert utm_epsg(lon, lat) == epsg
 
 
 def test_grids_that_say_too_little_are_refused(model, tmp_path):
     nothing = np.full((20, 20), np.nan, np.float32)
-    with pytest.raises(InputError, match="no epipolar model"):
+    with pytest.raises(InputError, match=r"a\.zarr"):
         write_dsm(write_grid(tmp_path / "a.zarr", None, nothing), tmp_path / "a.tif")
-    with pytest.raises(InputError, match="no pixel has a disparity"):
+    with pytest.raises(InputError, match=r"b\.zarr"):
         write_dsm(write_grid(tmp_path / "b.zarr", model, nothing), tmp_path / "b.tif")

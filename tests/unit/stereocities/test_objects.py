@@ -1,4 +1,4 @@
-"""Crowns of a canopy: their surface, number, pulses and leaves, against what geometry asks."""
+"""Buildings, vehicles and crowns of a city, against what its spec and geometry ask."""
 
 from __future__ import annotations
 
@@ -9,21 +9,59 @@ import laspy
 import numpy as np
 import pytest
 
+from stereocities.appearance import VEHICLE
 from stereocities.camera import rays
-from stereocities.canopy import BOUGHS
 from stereocities.cities import CitySpec, lidar_files
 from stereocities.lidar import INSIDE, simulate_lidar_tile
+from stereocities.objects import BOUGHS
 from stereocities.render import prepare
-from stereocities.surfaces import IN_IMAGES, IN_LEFT, IN_LIDAR, IN_RIGHT, terrain_heights
+from stereocities.surfaces import IN_IMAGES, IN_LEFT, IN_LIDAR, IN_RIGHT
 from stereocities.world import build_surfaces
 
-from ...synthetic.small_cities import GROUND, TREE
+from ...synthetic.small_cities import GROUND, TOWN, TREE
 from ...synthetic.wooded_cities import BARE_RIGHT, CANOPY, OPEN, WOODED, shown_by
 
 
-def crowns_of(city: CitySpec, bits: int) -> np.ndarray:
-    s = prepare(city, city.scenes[0]).surfaces
-    return s.trees[s.tree_view == bits]
+def test_buildings_are_as_many_as_the_share_and_flat_where_asked() -> None:
+    half = replace(TOWN, character=replace(TOWN.character, buildings=0.5, flat_roofs=True))
+    few, all_of_them = build_surfaces(half), build_surfaces(TOWN)
+    assert 0.35 < len(few.boxes) / len(all_of_them.boxes) < 0.65
+    assert (few.boxes[:, 7] == 0).all() and (all_of_them.boxes[:, 7] > 0).any()
+
+
+def test_vehicles_are_elsewhere_in_each_view() -> None:
+    city = replace(TOWN, name="Busy", character=replace(TOWN.character, vehicles=40.0))
+    s, none = build_surfaces(city), build_surfaces(TOWN)
+    cars = s.box_style[:, 2] == VEHICLE
+    np.testing.assert_array_equal(s.boxes[~cars], none.boxes)
+    count = {bits: (s.box_view[cars] == bits).sum() for bits in (1, 2, 4, 8)}
+    assert min(count.values()) >= 10
+    # those that creep: the same body and paint in both views, some metres apart
+    left, right = (s.boxes[cars & (s.box_view == bits)] for bits in (IN_LEFT, IN_RIGHT))
+    phase = [s.box_style[cars & (s.box_view == bits), 3] for bits in (IN_LEFT, IN_RIGHT)]
+    both, i, j = np.intersect1d(*phase, return_indices=True)
+    assert len(both) >= 10
+    way = right[j, :2] - left[i, :2]
+    moved = np.hypot(*way.T)
+    assert moved.min() >= 0.5 - 1e-9 and moved.max() <= 6.0 + 1e-9
+    across = way[:, 0] * left[i, 3] - way[:, 1] * left[i, 2]
+    assert np.abs(across).max() < 1e-9  # along the street
+    # on a car of the left view alone the truth knows no counterpart
+    scene = city.scenes[0]
+    shown = shown_by(city, "left", 1.0)
+    ready = prepare(city, scene)
+    xyz = ready.frame.from_geodetic(np.column_stack([shown[n] for n in ("lon", "lat", "height")]))
+    on = np.zeros(len(xyz), bool)
+    for x, y, ux, uy, a, b, top, _ in left:
+        dx, dy = xyz[:, 0] - x, xyz[:, 1] - y
+        on |= (
+            (np.abs(dx * ux + dy * uy) < a - 0.1)
+            & (np.abs(dy * ux - dx * uy) < b - 0.1)
+            & (np.abs(xyz[:, 2] - top) < 0.01)
+        )
+    assert on.sum() > 20
+    assert not shown["visible_right"][on].any() and not shown["hidden_right"][on].any()
+    assert (shown["changed"][on] == 2).all()
 
 
 def test_the_top_of_a_rough_crown_is_the_highest_of_its_ellipsoids_on_the_ray() -> None:
@@ -52,38 +90,6 @@ def test_the_top_of_a_rough_crown_is_the_highest_of_its_ellipsoids_on_the_ray() 
         assert z[np.argmax(inside)] == pytest.approx(point[2], abs=0.003)
 
 
-def test_rough_crowns_are_rougher_than_smooth_ones_and_no_wider() -> None:
-    smooth = replace(OPEN, character=replace(OPEN.character, canopy=replace(CANOPY, lobes=0)))
-    whole, parts = build_surfaces(smooth).trees, build_surfaces(OPEN).trees
-    assert len(parts) == (CANOPY.lobes + 1) * len(whole)
-    lobes = parts[len(whole) :].reshape(len(whole), CANOPY.lobes, 6)
-    away = np.hypot(*(lobes[..., :2] - whole[:, None, :2]).transpose(2, 0, 1))
-    assert (away + lobes[..., 3] <= whole[:, None, 3] * (1 + 1e-9)).all()
-    assert (lobes[..., 2] + lobes[..., 4] <= whole[:, None, 2] + whole[:, None, 4] + 1e-9).all()
-    height = [shown_by(city, "left", 1.0) for city in (smooth, OPEN)]
-    # second differences along a row where both show the same crown's middle
-    bend = []
-    for shown in height:
-        rows = shown["height"].reshape(len(np.unique(shown["row"])), -1)
-        tree = (shown["surface"] == TREE).reshape(rows.shape)
-        inner = tree[:, :-2] & tree[:, 1:-1] & tree[:, 2:]
-        bend.append(np.median(np.abs(np.diff(rows, 2, axis=1))[inner]))
-    assert bend[1] > 1.2 * bend[0]
-
-
-def test_a_canopy_has_as_many_crowns_as_it_says() -> None:
-    for arrangement in ("single", "rows", "forest"):
-        canopy = replace(CANOPY, arrangement=arrangement, lobes=0)
-        city = replace(OPEN, character=replace(OPEN.character, canopy=canopy), margin_m=400.0)
-        s = build_surfaces(city)
-        near = np.abs(s.trees[:, :2]).max(axis=1) < 250.0  # all of it within the margin
-        expected = 500.0**2 / CANOPY.ground_m2
-        assert near.sum() == pytest.approx(expected, rel=0.5 if arrangement == "forest" else 0.1)
-        cells = np.histogram2d(*s.trees[near, :2].T, bins=16)[0]
-        clustering = cells.var() / cells.mean()
-        assert (clustering > 2.0) == (arrangement == "forest")
-
-
 def test_a_share_of_the_pulses_passes_crowns(tmp_path: Path) -> None:
     """What lies below the tops: a porous city against the same one with closed crowns."""
     share = []
@@ -100,6 +106,11 @@ def test_a_share_of_the_pulses_passes_crowns(tmp_path: Path) -> None:
         assert found / share[0] == pytest.approx(1.0 - porosity * (1.0 - INSIDE), abs=0.02)
 
 
+def crowns_of(city: CitySpec, bits: int) -> np.ndarray:
+    s = prepare(city, city.scenes[0]).surfaces
+    return s.trees[s.tree_view == bits]
+
+
 def test_a_bare_view_sees_the_ground_below_crowns() -> None:
     shown = {view: shown_by(BARE_RIGHT, view) for view in ("left", "right")}
     share = {view: (of["surface"] == TREE).mean() for view, of in shown.items()}
@@ -113,12 +124,6 @@ def test_a_bare_view_sees_the_ground_below_crowns() -> None:
     right = shown["right"]
     below = (right["surface"] == GROUND) & (right["changed"] == 1)
     assert below.mean() > 0.5 * leafy
-    ready = prepare(BARE_RIGHT, BARE_RIGHT.scenes[0])
-    xyz = ready.frame.from_geodetic(
-        np.column_stack([right[n][below] for n in ("lon", "lat", "height")])
-    )
-    z = terrain_heights(ready.surfaces, xyz[:, :2])[:, 0]
-    assert np.abs(z - xyz[:, 2]).max() < 2e-3
     assert len(crowns_of(BARE_RIGHT, IN_RIGHT)) == BOUGHS * len(
         crowns_of(WOODED, IN_IMAGES | IN_LIDAR)
     ) // (CANOPY.lobes + 1)

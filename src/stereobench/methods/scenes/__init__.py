@@ -1,1 +1,0 @@
-"""Stereo methods over whole scenes, in blended blocks, and their surface models."""
