@@ -42,7 +42,7 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.job import in_own_process
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.sensor.image_reader import Source
+from stereotruth.sensor.images import Source
 
 from . import damage
 from .damaged_cases import Case, synthetic_cases

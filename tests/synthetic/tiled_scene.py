@@ -14,8 +14,7 @@ import rasterio
 from stereotruth.core.config.labels import Export, Limits
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.sensor.colours import COLOURS
+from stereotruth.epipolar.model import COLOURS, EpipolarModel
 from stereotruth.sensor.rpc import RPC, SensorModel
 from stereotruth.tiles.export import City, Extras, export_city
 from stereotruth.tiles.scene_stores import SceneFiles

@@ -27,7 +27,7 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.project.check import check_project
 from stereotruth.project.findings import Level
-from stereotruth.sensor.image_reader import open_pair
+from stereotruth.sensor.images import open_pair
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, hashes, row_of
 

@@ -21,7 +21,7 @@ rule surface:
     params:
         sources=upstream("surface"),
         script=content_of("../scripts/surface.py"),
-        code=source_digest("stereotruth.surface.make_surface", "stereotruth.sensor.shown_ground"),
+        code=source_digest("stereotruth.surface.make_surface", "stereotruth.sensor.pair_geometry"),
     message:
         "Making the surface of the points of scene {wildcards.scene}"
     script:

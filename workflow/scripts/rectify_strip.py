@@ -7,7 +7,7 @@ from stereotruth.core.products.grids import Strip
 from stereotruth.core.products.making import making
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.sensor.image_reader import open_pair
+from stereotruth.sensor.images import open_pair
 
 if __name__ == "__main__":
     scene, strip = snakemake.wildcards.scene, Strip.parse(snakemake.wildcards.strip)

@@ -4,7 +4,7 @@ from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 from stereotruth.core.products.provenance import checksums
 from stereotruth.lidar.point_store import open_stores
-from stereotruth.sensor.shown_ground import GroundOfImages
+from stereotruth.sensor.pair_geometry import GroundOfImages
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import ground_cell
 

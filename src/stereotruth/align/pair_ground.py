@@ -20,10 +20,9 @@ from ..core.errors import InputError
 from ..core.numerics.hull import corners_of_hull
 from ..core.products.ungeoreferenced import open_raster
 from ..lidar.footprint import Footprint
-from ..sensor.pair_geometry import find_overlap, find_rotation
+from ..sensor.pair_geometry import find_overlap, find_rotation, frame, steps
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import read_rpc
-from ..sensor.virtual_points import frame, steps
 from .align import RPC_SHIFT, RPC_TILT
 
 Floats = NDArray[np.float64]

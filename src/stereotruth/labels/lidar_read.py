@@ -15,7 +15,7 @@ from ..epipolar.model import EpipolarModel
 from ..lidar.footprint import CELL_DEG, Footprint
 from ..lidar.lattice import cell_key
 from ..lidar.point_store import PointStore
-from ..sensor.virtual_points import frame, inside
+from ..sensor.pair_geometry import frame, inside
 from .scene_inputs import SceneInputs
 
 log = logging.getLogger("stereotruth")

@@ -1,7 +1,7 @@
 """How rough the ground of a site is, buildings and trees included, by its points.
 
 What stands up looks different from its sides and casts shadows, so that roughness tells how well
-images of a site match: :mod:`stereotruth.sensor.pair_quality`.
+images of a site match: :mod:`stereotruth.sensor.site_pairs`.
 """
 
 from __future__ import annotations

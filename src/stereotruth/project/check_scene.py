@@ -28,7 +28,7 @@ from ..lidar.footprint import Footprint
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..lidar.overlap_check import FAR, Box, apart, refuse_apart
 from ..lidar.survey import SurveyedFile
-from ..sensor.image_reader import MAX_PIXELS, Source, bands_of
+from ..sensor.images import MAX_PIXELS, Source, bands_of
 from .check_lidar import check_lidar
 from .check_strips import check_strips
 from .check_tiles import Nodes, check_frame, check_labels, pixel_m2

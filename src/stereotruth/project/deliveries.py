@@ -13,21 +13,11 @@ from ..align.gcp_checks import open_view
 from ..core.errors import InputError
 from ..core.products.folders import files_below
 from ..core.products.ungeoreferenced import open_raster
+from ..sensor.deliveries import OTHERS, VIEWS
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import rpc_file
 
 SUFFIXES = {".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img"}
-# Names of suppliers (GaoFen-7, ZY-3, Cartosat, ALOS PRISM) for the views along the track, and the
-# plain words.
-VIEWS = (
-    ("left", re.compile(r"(?<![A-Za-z])(BWD|BACKWARD|LEFT)(?![A-Za-z])", re.IGNORECASE)),
-    ("right", re.compile(r"(?<![A-Za-z])(FWD|FORWARD|RIGHT)(?![A-Za-z])", re.IGNORECASE)),
-)
-# What lies beside the images that are wanted: bands of colour, browse images.
-OTHERS = re.compile(
-    r"(?<![A-Za-z])(MUX|MSS?|MULTI|BROWSE|THUMB\w*|QUICKLOOK|PREVIEW|ICON)(?![A-Za-z])",
-    re.IGNORECASE,
-)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from datetime import date
 from ..core import sheets
 from ..core.dates import decimal_year, epoch_year
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
-from ..sensor.acquisition import read_acquisition
+from ..sensor.deliveries import read_acquisition
 from .project import is_synthetic, names_in_pair
 
 LOOKED_AT = 10  # scenes of a city whose deliveries are looked into

@@ -14,8 +14,7 @@ import zarr
 from ..core.errors import InputError
 from ..core.products.grids import require_complete
 from ..core.products.provenance import digest, file_sha256
-from ..epipolar.model import EpipolarModel
-from ..sensor.colours import COLOURS
+from ..epipolar.model import COLOURS, EpipolarModel
 from .label_doubts import ALIGNMENT, LIDAR, STRIPS, ToldDoubt
 from .orientation import sensor_record
 from .sure_labels import Labels, tile_flags, tile_labels
@@ -45,7 +44,7 @@ class SceneStores:
     labels are less sure than the scatter of their tie points, or empty.
     ``disparity``, ``status``, and these of the right view (``of_right``), as the tiles have them.
     ``acquired``: days (ISO) of the left and right image, empty where they are not known. ``light``:
-    whether the images share it, and what decided that (:mod:`..epipolar.pair_light`).
+    whether the images share it, and what decided that (:func:`..sensor.site_pairs.pair_light`).
     """
 
     scene: str

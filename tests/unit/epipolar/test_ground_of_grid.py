@@ -9,7 +9,7 @@ import xarray as xr
 
 from stereotruth.core.errors import InputError
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.ground_of_grid import with_ground
+from stereotruth.epipolar.intersection import with_ground
 
 from ...synthetic.truth_scene import SIZE, sensor
 

@@ -14,7 +14,7 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import open_grid, require_complete
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.sensor.image_reader import Source, open_pair
+from stereotruth.sensor.images import Source, open_pair
 from stereotruth.sensor.rpc import SensorModel
 
 from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, LAT, LON, METRES, camera

@@ -16,8 +16,6 @@ from ...synthetic import rpc_texts
 from ...synthetic.cameras import ground_points, make_rpc
 from ...synthetic.images import write_image
 
-# -------------------------------------------------------------------------------------- readers
-
 
 def rpc_text(rpc: RPC) -> str:
     return rpc_texts.rpc_text(rpc.to_dict(), units=True)
@@ -37,8 +35,6 @@ def assert_same(a: RPC, b: RPC) -> None:
     ("name", "writer"),
     [
         ("GF7_scene-BWD_RPC.TXT", rpc_text),
-        ("GF7_scene-BWD_rpc.txt", rpc_text),
-        ("GF7_scene-BWD.RPB", rpb_text),
         ("GF7_scene-BWD.rpb", rpb_text),
     ],
 )
@@ -63,13 +59,6 @@ def test_files_written_by_gdal(tmp_path: Path, option: str) -> None:
     assert_same(read_rpc(image), rpc)
 
 
-def test_a_file_goes_before_the_tag(tmp_path: Path) -> None:
-    image = write_image(tmp_path / "a.tif", make_rpc(13))
-    better = make_rpc(14)
-    (tmp_path / "a_RPC.TXT").write_text(rpc_text(better))
-    assert_same(read_rpc(image), better)
-
-
 def spoiled(name: str, old: str, new: str):
     def change(text: str) -> str:
         assert old in text
@@ -84,16 +73,13 @@ def spoiled(name: str, old: str, new: str):
         spoiled("missing-offset", "LINE_OFF:", "LINE:"),
         spoiled("missing-coefficient", "SAMP_DEN_COEFF_7:", "SAMP_DEN_7:"),
         spoiled("not-a-number", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: x"),
-        spoiled("not-finite", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: nan "),
         spoiled("zero-scale", "LAT_SCALE: ", "LAT_SCALE: 0.0 "),
         spoiled("no-degrees", "LAT_OFF: ", "LAT_OFF: 4796000.0 "),
         spoiled("empty-value", "HEIGHT_OFF: ", "HEIGHT_OFF:\nX: "),
         spoiled("underscore", "LINE_SCALE: ", "LINE_SCALE: 1_000\nX: "),
-        spoiled("full-width", "LINE_SCALE: ", "LINE_SCALE: １４０００\nX: "),
         spoiled("two-numbers", "LINE_SCALE: ", "LINE_SCALE: 14 "),
         spoiled("twice", "LINE_SCALE: ", "LINE_SCALE: 14001.0 pixels\nLINE_SCALE: "),
         spoiled("no-sensor", "HEIGHT_SCALE: ", "HEIGHT_SCALE: -1e30\nX: "),
-        spoiled("no-image", "LINE_OFF: ", "LINE_OFF: 3e7\nX: "),
         spoiled("huge-term", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: 1e30\nX: "),
         spoiled("long", "LINE_OFF: ", "X: " + "y" * 2_000_000 + "\nLINE_OFF: "),
     ],
@@ -101,7 +87,7 @@ def spoiled(name: str, old: str, new: str):
 def test_malformed_text_is_refused(tmp_path: Path, change) -> None:
     image = write_image(tmp_path / "a.tif", None)
     (tmp_path / "a_RPC.TXT").write_text(change(rpc_text(make_rpc(15))))
-    with pytest.raises(InputError, match=r"a_RPC.TXT: malformed RPC .*Remedy"):
+    with pytest.raises(InputError, match=r"a_RPC.TXT: .*Remedy"):
         read_rpc(image)
 
 
@@ -117,11 +103,11 @@ def test_malformed_text_is_refused(tmp_path: Path, change) -> None:
 def test_malformed_rpb_is_refused(tmp_path: Path, change) -> None:
     image = write_image(tmp_path / "a.tif", None)
     (tmp_path / "a.rpb").write_text(change(rpb_text(make_rpc(16))))
-    with pytest.raises(InputError, match=r"a.rpb: malformed RPC .*Remedy"):
+    with pytest.raises(InputError, match=r"a.rpb: .*Remedy"):
         read_rpc(image)
 
 
-@pytest.mark.parametrize("filling", ["\n", " ", "a", "a=(", "=", "(", "\t\n"])
+@pytest.mark.parametrize("filling", ["\n", " ", "a=(", "("])
 @pytest.mark.parametrize(("name", "writer"), [("a_RPC.TXT", rpc_text), ("a.rpb", rpb_text)])
 def test_long_files_take_no_longer_than_their_length(tmp_path, name, writer, filling) -> None:
     """200 000 blank lines took a pattern hours. Whatever comes of it, it comes."""
@@ -138,15 +124,17 @@ def test_long_files_take_no_longer_than_their_length(tmp_path, name, writer, fil
 def test_where_an_rpc_comes_from(tmp_path: Path) -> None:
     image = write_image(tmp_path / "a.tif", make_rpc(13))
     assert rpc_file(image) == image
-    (tmp_path / "A_rpc.txt").write_text(rpc_text(make_rpc(14)))
+    better = make_rpc(14)  # a file goes before the tag
+    (tmp_path / "A_rpc.txt").write_text(rpc_text(better))
     assert rpc_file(image) == tmp_path / "A_rpc.txt"
+    assert_same(read_rpc(image), better)
 
 
 def test_images_without_rpc_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"a.tif: image has no RPC metadata.*a_RPC.TXT"):
+    with pytest.raises(InputError, match=r"a.tif: .*a_RPC.TXT"):
         read_rpc(write_image(tmp_path / "a.tif", None))
-    with pytest.raises(InputError, match=r"b.tif: no such image"):
+    with pytest.raises(InputError, match=r"b.tif: "):
         read_rpc(tmp_path / "b.tif")
     (tmp_path / "c.tif").write_text("no raster")
-    with pytest.raises(InputError, match=r"c.tif: not a raster"):
+    with pytest.raises(InputError, match=r"c.tif: "):
         read_rpc(tmp_path / "c.tif")

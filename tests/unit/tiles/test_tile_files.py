@@ -12,7 +12,7 @@ import zarr
 from scipy.ndimage import map_coordinates
 
 from stereotruth.core.products.rasters import read_image, read_tile, write_tiff
-from stereotruth.sensor.colours import COLOURS
+from stereotruth.epipolar.model import COLOURS
 from stereotruth.tiles.scene_stores import SceneFiles
 from stereotruth.tiles.tile_files import round_disparity
 

@@ -1,12 +1,23 @@
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
+import numpy as np
 import pytest
 
-from stereotruth.sensor.acquisition import Acquisition, read_acquisition
-from stereotruth.sensor.sun import sun_over
+from stereocities.sites import sun_at
+from stereotruth.sensor import deliveries
+from stereotruth.sensor.deliveries import (
+    Acquisition,
+    Form,
+    between_suns,
+    files_beside,
+    read_acquisition,
+    shadow_shift,
+    sun_over,
+    toward_sun,
+)
 
 PLACE = 115.4, 30.2
 TIME = datetime(2020, 10, 25, 3, 12, 45, tzinfo=UTC)
@@ -56,9 +67,7 @@ def image(tmp_path):
     ("name", "text"),
     [
         ("one.IMD", IMD),
-        ("one.imd", IMD),
         ("one.xml", DIMAP),
-        ("item.json", json.dumps(STAC)),
         ("any.json", json.dumps(STAC)),
     ],
 )
@@ -73,6 +82,15 @@ def test_airbus_names_its_files_by_the_product(tmp_path):
     (tmp_path / "DIM_PHR1A_P_202010250312.XML").write_text(DIMAP)
     (tmp_path / "DIM_PHR1B_P_201901010000.XML").write_text(DIMAP.replace("2020", "2019"))
     assert read_acquisition(image, PLACE).time == TIME
+
+
+def test_a_new_form_of_delivery_is_a_line_of_a_table(image, monkeypatch):
+    def read(text, place):
+        return Acquisition(deliveries.utc(text.partition("=")[2], UTC), (161.5, 44.9))
+
+    monkeypatch.setattr(deliveries, "FORMS", (*deliveries.FORMS, Form(".meta", read)))
+    image.with_name("one.META").write_text("taken=2020-10-25T03:12:45")
+    assert read_acquisition(image, PLACE) == Acquisition(TIME, (161.5, 44.9), "one.META")
 
 
 @pytest.mark.parametrize("clock", ["2020-10-25 03:12:45", "2020-10-25 11:12:45"])
@@ -102,7 +120,6 @@ def test_without_sun_it_is_computed_and_without_zone_there_is_no_time(image):
         ("other.IMD", IMD),
         ("other.xml", DIMAP),
         ("one.xml", "<ProductMetaData>"),
-        ("one.json", "[1, 2]"),
         ("one.json", "{"),
         ("one.IMD", "firstLineTime = yesterday;"),
     ],
@@ -110,3 +127,50 @@ def test_without_sun_it_is_computed_and_without_zone_there_is_no_time(image):
 def test_files_of_other_images_and_damaged_ones_say_nothing(image, name, text):
     image.with_name(name).write_text(text)
     assert read_acquisition(image, PLACE) == Acquisition()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("Left.TIF.msk", "left.tif.aux.xml", "LEFT.AUX.XML", "left_Rpc.Txt", "left.RPB"),
+        *("left.Imd", "left.tfw", "LEFT.TIFW", "RPC_PHR1A_P_001.XML"),
+    ],
+)
+def test_files_that_readers_take_into_account_are_found_in_any_case(tmp_path, name):
+    (tmp_path / "Left.tif").touch()
+    (tmp_path / name).touch()
+    for other in ("right.tif", "right_RPC.TXT", "left.txt", "left2.rpb", "left.tif.bak", "a.xml"):
+        (tmp_path / other).touch()
+    assert files_beside(tmp_path / "Left.tif") == [tmp_path / name]
+
+
+def test_an_image_in_a_folder_that_is_not_there_has_none(tmp_path):
+    assert files_beside(tmp_path / "nowhere/left.tif") == []
+
+
+def test_nrel_s_example():
+    """Reda and Andreas 2004, table A5.1, without the refraction of 0.016 degrees."""
+    time = datetime(2003, 10, 17, 19, 30, 30, tzinfo=UTC)
+    azimuth, elevation = sun_over(time, -105.1786, 39.742476)
+    assert azimuth == pytest.approx(194.340, abs=0.02)
+    assert elevation == pytest.approx(90 - 50.112 - 0.016, abs=0.02)
+
+
+def test_it_agrees_with_the_simulator_s_own_formula():
+    for k in range(40):
+        time = datetime(2012, 1, 1, tzinfo=UTC) + timedelta(hours=3356.5 * k)
+        for place in ((0.0, 0.0), (114.3, 30.6), (-70.6, -33.4)):
+            cosine = toward_sun(*sun_over(time, *place)) @ toward_sun(*sun_at(time, *place))
+            assert np.degrees(np.arccos(min(cosine, 1.0))) < 0.03
+
+
+def test_time_zones_are_one_time():
+    utc = datetime.fromisoformat("2020-10-25T03:12:45Z")
+    here = datetime.fromisoformat("2020-10-25T11:12:45+08:00")
+    assert sun_over(utc, 115.0, 30.0) == sun_over(here, 115.0, 30.0)
+
+
+def test_suns():
+    assert between_suns((180, 40), (180, 60)) == pytest.approx(20)
+    # shadows of one height: 1 / tan 45° north, and as far west
+    assert shadow_shift((180, 45), (90, 45)) == pytest.approx(np.sqrt(2))
