@@ -32,7 +32,7 @@ REACH = {
     "evaluate_truth": {"evaluate", "tiles"},
     "evaluate_truth_city": {"evaluate", "tiles"},
     "evaluate_images": {"epipolar", "evaluate", "pages", "tiles"},
-    "export": {"epipolar", "pages", "sensor", "tiles"},
+    "export": {"align", "epipolar", "pages", "sensor", "tiles"},
     "originals": {"sensor", "tiles"},
     "dataset": {"pages", "sensor", "tiles"},
     "image_heights": {"align", "epipolar", "labels", "lidar", "sensor", "surface"},

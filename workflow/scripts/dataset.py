@@ -2,8 +2,7 @@
 
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
-from stereotruth.tiles.other_layouts import write_layout
-from stereotruth.tiles.published_layout import assemble_dataset
+from stereotruth.tiles.layouts import assemble_dataset, write_layout
 
 if __name__ == "__main__":
     dataset, *others = snakemake.output

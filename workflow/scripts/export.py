@@ -3,13 +3,14 @@
 import json
 from pathlib import Path
 
+from stereotruth.align.aligned_pair import Alignment
 from stereotruth.core.config.labels import Export
 from stereotruth.core.job import job
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.making import making
 from stereotruth.tiles.export import City, Extras, export_city
 from stereotruth.tiles.scene_stores import SceneFiles
-from stereotruth.tiles.summary import summary_lines
+from stereotruth.tiles.tile_checks import summary_lines
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city
@@ -27,6 +28,7 @@ if __name__ == "__main__":
             given.alignment,
             of_right,
             snakemake.params.acquired,
+            map(Alignment.load, given.alignment),
         )
         made = snakemake.output
         summary = export_city(

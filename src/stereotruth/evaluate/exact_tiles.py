@@ -26,7 +26,7 @@ from ..core.products.rasters import write_tiff
 from ..epipolar.model import EpipolarModel
 from ..epipolar.rectify import rectify
 from ..sensor.images import open_pair
-from ..tiles.split_names import SPLITS
+from ..tiles.manifest import SPLITS
 from .epipolar_truth import truth_window
 
 NODATA = -999.0

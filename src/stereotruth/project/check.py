@@ -12,7 +12,7 @@ from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.sheets import Scene
 from ..lidar.frames import Epoch
-from ..tiles.windows import cell_step
+from ..tiles.scene_stores import cell_step
 from .check_scene import Looked, SceneFacts, check_scene
 from .epochs import epoch_of_city
 from .findings import Findings, Level

@@ -15,7 +15,7 @@ from ..core.numerics.degrees import DEGREE_M
 from ..core.numerics.summed_area import summed_area, window_sums
 from ..epipolar.model import EpipolarModel
 from ..lidar.survey import SurveyedFile
-from ..tiles.windows import cell_step
+from ..tiles.scene_stores import cell_step
 from .estimates import estimates
 from .findings import Findings, Level
 

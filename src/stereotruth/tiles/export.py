@@ -12,10 +12,7 @@ Rules for a pair, at its window of the scene's grid:
   complete images go under ``unlabelled/``.
 
 Each labelled pair is held against its images as it is written: SIFT matches, image warping, and the
-gates of :mod:`.quality_limits`, which flag tiles and scenes in the manifest and the summary.
-
-The phase of each scene's tile grid (origin of its first window, in steps of about an eighth of a
-tile) is that which gives most labelled pairs, then most pairs, then most labelled pixels.
+gates of :mod:`.label_doubts`, which flag tiles and scenes in the manifest and the summary.
 """
 
 from __future__ import annotations
@@ -36,26 +33,37 @@ from ..core.errors import InputError
 from ..core.job import progress
 from ..core.products.files import atomic_file, atomic_folder, growing_table, write_table
 from ..core.products.provenance import describe, file_sha256, own_digest, source_digest
-from .footprints import FOOTPRINTS, feature, write_footprints
-from .ground_looks import write_ground_looks
-from .label_doubts import Doubt, ToldDoubt, doubts, surface_figures
-from .layer_kinds import column
+from .label_doubts import Doubt, ToldDoubt, doubts, flag, missed, surface_figures
+from .manifest import FOOTPRINTS, NONE, STATUS_COLOURS_FILE, column
 from .orientation import save
-from .quality_limits import flag, missed
 from .quick_looks import (
-    STATUS_COLOURS_FILE,
     draw_contact_sheet,
     draw_coverage,
+    feature,
+    write_footprints,
+    write_ground_looks,
     write_status_colours,
 )
-from .scene_stores import SceneFiles, SceneStores, open_stores
+from .scene_stores import (
+    SceneFiles,
+    SceneStores,
+    Window,
+    cell_step,
+    choose_windows,
+    open_stores,
+    scan_scene,
+)
 from .sift_matches import MATCH_COLUMNS, match_rows
-from .split_names import NONE
 from .splits import Place, scaled_counts, split_tiles
-from .summary import in_counts, summarise
-from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks, sigma_by_surface
+from .tile_checks import (
+    CHECK_COLUMNS,
+    SceneChecks,
+    TileChecks,
+    in_counts,
+    sigma_by_surface,
+    summarise,
+)
 from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
-from .windows import Window, cell_step, choose_windows, scan_scene
 
 log = logging.getLogger("stereotruth")
 
@@ -131,8 +139,9 @@ class Extras:
     ground_looks: str | Path | None = None
 
     @contextmanager
-    def being_written(self) -> Iterator[_ExtrasBeingWritten]:
-        """Places that become the files when the block ends well, all at the end.
+    def being_written(self) -> Iterator[tuple[Extras, Any]]:
+        """Places that become the files when the block ends well, all at the end; and the writer of
+        the table of matches.
 
         A job that outlives its run cannot be found halfway.
         """
@@ -147,32 +156,7 @@ class Extras:
             looks = None
             if self.ground_looks is not None:
                 looks = stack.enter_context(atomic_folder(self.ground_looks))
-            yield _ExtrasBeingWritten(coverage, contact_sheet, table, looks)
-
-
-@dataclass(frozen=True)
-class _ExtrasBeingWritten:
-    """Where the extras are written until they are whole."""
-
-    coverage: Path | None
-    contact_sheet: Path | None
-    table: Any
-    looks: Path | None
-
-    def add_matches(self, row: Mapping[str, Any], checks: TileChecks) -> None:
-        """Add a tile's matches to the table."""
-        if self.table is not None:
-            head = {key: row[key] for key in ("city", "scene", "tile", "class")}
-            self.table.writerows(match_rows(head, checks.matches))
-
-    def draw(
-        self, city: str, rows: Sequence[dict[str, Any]], windows: _Windows, tiles: Path, nodata: Any
-    ) -> None:
-        """Draw both figures, one after the other: Matplotlib is not made for threads."""
-        if self.coverage is not None:
-            draw_coverage(self.coverage, city, rows, windows.pictures)
-        if self.contact_sheet is not None:
-            draw_contact_sheet(self.contact_sheet, city, rows, tiles, nodata)
+            yield Extras(coverage, contact_sheet, self.matches, looks), table
 
 
 @dataclass(frozen=True)
@@ -231,16 +215,22 @@ def export_city(
     """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
 
     ``scenes``: per scene its id, disparity.zarr, left.zarr, right.zarr and optionally
-    alignment.json (for the record) and the store of the right view's labels. ``extras``: what is
+    alignment.json (for the record), the store of the right view's labels, the days of its images
+    and what the alignment says. ``extras``: what is
     made besides. ``work``: folder in which finished tiles wait for a later call that would make the
     same, by default a hidden one beside ``out_dir``. Returns a summary, see
-    :func:`.summary.summary_lines`.
+    :func:`.tile_checks.summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
     """
     out, extras = Path(out_dir), extras or Extras()
-    _refuse_nodata(settings)
+    dtype, nodata = settings.disparity_dtype, settings.nodata
+    if float(np.dtype(dtype).type(nodata)) != float(nodata):
+        raise InputError(
+            f"nodata {nodata:g} cannot be stored in {dtype}",
+            remedy="set tiles.nodata to -999, or tiles.disparity_dtype to float32",
+        )
     windows = _Windows.of(scenes, settings, workers)
     if not any(window.labelled for _, window in windows.chosen):
         sources = windows.sources
@@ -252,8 +242,8 @@ def export_city(
         city=city.city,
         prefix=city.prefix,
         size=settings.size,
-        dtype=settings.disparity_dtype,
-        nodata=settings.nodata,
+        dtype=dtype,
+        nodata=nodata,
         building_share=settings.building_share,
         limits=settings.quality,
         code=code or source_digest("stereotruth.tiles.export"),
@@ -274,15 +264,6 @@ def export_city(
         save(scratch / "export.json", record | {"digest": own_digest(record)})
         _forget_others(cut, rows)
     return summary
-
-
-def _refuse_nodata(settings: Export) -> None:
-    dtype, nodata = settings.disparity_dtype, settings.nodata
-    if float(np.dtype(dtype).type(nodata)) != float(nodata):
-        raise InputError(
-            f"nodata {nodata:g} cannot be stored in {dtype}",
-            remedy="set tiles.nodata to -999, or tiles.disparity_dtype to float32",
-        )
 
 
 def _parameters(settings: Export, city: City) -> dict[str, Any]:
@@ -307,31 +288,41 @@ def _write_tiles(
     scratch: Path,
     windows: _Windows,
     cut: Cut,
-    beside: _ExtrasBeingWritten,
+    beside: tuple[Extras, Any],
     parameters: Mapping[str, Any],
     settings: Export,
     workers: int,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Write tiles, manifest, footprints and extras; the summary, and the manifest's rows."""
+    extras, table = beside
 
     def write(k: int) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
         return write_tile(scratch, *windows.chosen[k], k, cut)
+
+    def draw(rows: Sequence[dict[str, Any]]) -> None:
+        """One figure after the other: Matplotlib is not made for threads."""
+        if extras.coverage is not None:
+            draw_coverage(extras.coverage, city, rows, windows.pictures)
+        if extras.contact_sheet is not None:
+            draw_contact_sheet(extras.contact_sheet, city, rows, scratch, settings.nodata)
 
     city, count = cut.city, len(windows.chosen)
     written, scene_checks = [], {s.scene: SceneChecks(s.gcp_rms) for s in windows.sources}
     with ThreadPoolExecutor(workers) as pool:
         tiles = pool.map(write, range(count))
         drawn = []  # while the last tiles are written
-        if beside.looks is not None:
-            drawn = [pool.submit(write_ground_looks, beside.looks, s) for s in windows.sources]
+        if (looks := extras.ground_looks) is not None:
+            drawn = [pool.submit(write_ground_looks, looks, s) for s in windows.sources]
         for row, ring, checks in progress(tiles, count, f"{city}: tiles"):
             written.append((row, ring))
             if checks is not None:
                 scene_checks[row["scene"]].add(checks, row["row0"], row["col0"])
-                beside.add_matches(row, checks)
+                if table is not None:
+                    head = {key: row[key] for key in ("city", "scene", "tile", "class")}
+                    table.writerows(match_rows(head, checks.matches))
         rows = [row for row, _ in written]
         splits = _split(written, parameters["split_counts"], settings.seed, settings.strict, city)
-        drawn.append(pool.submit(beside.draw, city, rows, windows, scratch, settings.nodata))
+        drawn.append(pool.submit(draw, rows))
         told = {source.scene: source.told for source in windows.sources}
         gates = _gates(city, rows, scene_checks, told, settings.quality, settings.strict)
         for source in windows.sources:

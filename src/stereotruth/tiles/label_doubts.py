@@ -1,4 +1,4 @@
-"""What the images say of a scene's labels, by surface, and whether that contradicts the labels.
+"""What images say of labels: doubts about a scene by surface, and limits of tiles and scenes.
 
 Of each surface the location of 'SIFT disparity less label' is found robustly (see
 :func:`location`), with a standard error from the scatter between cells of ``CELL_PX``: matches of
@@ -11,20 +11,24 @@ are farther off than they state. One that the alignment's uncertainty does expla
 significant without it and larger than ``REMARK_PX``, is a remark: the labels are honest and could
 be better. Crowns are told, and raise neither. Rows are judged in the same way by the y-parallax,
 which should be zero.
+
+Limits hold figures that need no truth: residuals of the control points, SIFT matches and image
+warping (section IV of the paper). A tile or scene beyond one is flagged, not dropped.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
+from ..core.config.labels import Limits
 from ..core.numerics.robust import TO_SIGMA, biweight
 from .label_surfaces import LabelSurface
 from .sift_matches import TileMatches
@@ -40,6 +44,16 @@ REACH = 3.0  # scales from the location at which a match no longer counts
 STEPS = 100  # of the iteration, at most
 PARALLAX = "y-parallax"
 ALIGNMENT, LIDAR, STRIPS = ABOUT = ("alignment", "LiDAR", "strips")  # what earlier stages tell of
+FIGURES = {  # the figure that a limit is for; of signed figures, the size counts
+    "max_gcp_rms_px": "gcp_rms_px",
+    "max_y_parallax_px": "y_parallax_median_px",
+    "max_sift_error_px": "sift_median_error_px",
+    "max_sift_mean_absolute_error_px": "sift_mean_absolute_error_px",
+    "min_sift_matches": "sift_matches",
+    "min_warp_correlation": "warp_correlation",
+    "min_agreement": "agreement",
+}
+OF_ERRORS = ("max_sift_error_px", "max_sift_mean_absolute_error_px")
 JUDGED = (LabelSurface.OPEN_GROUND.words, LabelSurface.ROOFS.words, PARALLAX)
 
 
@@ -241,3 +255,39 @@ def doubts(biases: Iterable[Bias], probability: float | None) -> list[Doubt]:
 def surface_figures(biases: Iterable[Bias]) -> dict[str, Any]:
     """By surface, JSON-ready."""
     return {bias.surface.replace(" ", "_"): bias.to_dict() for bias in biases}
+
+
+class Miss(NamedTuple):
+    """A gate that was missed: its name in the configuration, the value found, the limit."""
+
+    gate: str
+    value: float
+    limit: float
+
+    def __str__(self) -> str:
+        word = "below" if self.gate.startswith("min_") else "above"
+        return f"{FIGURES[self.gate]} {self.value:.3g} is {word} {self.gate} {self.limit:g}"
+
+
+def missed(figures: Mapping[str, float | int | None], limits: Limits) -> list[Miss]:
+    """Gates that the figures miss, in the order of the limits.
+
+    A figure that is absent, None or NaN misses nothing. With fewer matches than
+    ``min_sift_matches``, that gate alone speaks for their errors: a few say nothing.
+    """
+    found = []
+    count = figures.get("sift_matches")
+    few = limits.min_sift_matches is not None and (count or 0) < limits.min_sift_matches
+    for gate, name in FIGURES.items():
+        limit, value = getattr(limits, gate), figures.get(name)
+        if limit is None or value is None or math.isnan(value) or (few and gate in OF_ERRORS):
+            continue
+        low = gate.startswith("min_")
+        if value < limit if low else abs(value) > limit:
+            found.append(Miss(gate, value, limit))
+    return found
+
+
+def flag(misses: Sequence[Miss]) -> str:
+    """Cell of the manifest: ``ok``, or the names of the missed gates with ``;`` between."""
+    return ";".join(miss.gate for miss in misses) or "ok"

@@ -35,9 +35,8 @@ from ..core.products.rasters import write_tiff
 from ..core.products.ungeoreferenced import open_raster
 from ..sensor.rpc import RPC
 from ..sensor.rpc_files import rpc_text
-from .layer_kinds import NODATA, LayerKind
-from .manifest import read_manifest
-from .polynomials import evaluate
+from .manifest import NODATA, LayerKind, read_manifest
+from .orientation import evaluate
 
 MARGIN_PX = 16  # of the crops around what the tiles show
 HEIGHTS = {

@@ -1,4 +1,4 @@
-"""One tile: its pixels, its files, its row of the manifest."""
+"""One tile: its pixels, its layers, its files, its row of the manifest."""
 
 from __future__ import annotations
 
@@ -18,23 +18,20 @@ from ..core.products.files import link
 from ..core.products.finished_pieces import Ledger
 from ..core.products.provenance import digest, file_sha256
 from ..core.products.rasters import write_tiff
+from ..epipolar.intersection import intersect
 from ..epipolar.warping import agreement, warp_rows
-from .label_surfaces import label_surfaces
-from .layer_kinds import column
+from .label_surfaces import Buildings, heights_above_ground, label_surfaces
+from .manifest import KINDS, NONE, column
 from .orientation import orientation, save
-from .scene_stores import SceneStores
+from .scene_stores import SceneStores, Window
 from .sift_matches import match_tile
-from .split_names import NONE
 from .tile_checks import TileChecks, check_cells, count_sigma
-from .tile_classes import Buildings
-from .tile_layers import tile_layers, write_layer
-from .windows import Window
 
 FILES = ("left", "right", "disp", "status", "orientation")
 RIGHT_FILES = ("disp_right", "status_right")  # labels of the right view, where a scene has them
-
-
 STEPS = 1024  # in a px, of disparities in 32 bits: they compress to little more than half
+MARGIN_PX = 128  # around a tile, from which the ground below its roofs is known
+Slices = tuple[slice, slice]  # rows and columns of a scene's grid
 
 
 def round_disparity(disparity: NDArray[np.floating], dtype: str) -> NDArray[np.float32]:
@@ -83,21 +80,18 @@ class _Crop:
 
     @classmethod
     def of(cls, source: SceneStores, window: Window, cut: Cut) -> _Crop:
-        rows, start = slice(window.row0, window.row0 + cut.size), window.col0 - window.offset
-        here = (rows, slice(window.col0, window.col0 + cut.size))
-        there = (rows, slice(start, start + cut.size))
+        here = window.of_left(cut.size)
+        there = here[0], slice(here[1].start - window.offset, here[1].stop - window.offset)
         disparity = source.disparity[here].astype(np.float64) - window.offset
         of_right = status_of_right = None
         if window.labelled and source.of_right is not None:
             values = source.of_right["disparity"][there].astype(np.float64) - window.offset
             of_right = round_disparity(values, cut.dtype)
             status_of_right = source.of_right["status"][there]
-        colours = (None, None)
+        colours = dict.fromkeys(("colour_left", "colour_right"))
         if source.colours is not None:
-            colours = (
-                np.stack([band[part] for band in bands])
-                for bands, part in zip(source.colours, (here, there))
-            )
+            for name, bands, part in zip(colours, source.colours, (here, there)):
+                colours[name] = np.stack([band[part] for band in bands])
         return cls(
             left=source.left[here],
             right=source.right[there],
@@ -106,7 +100,7 @@ class _Crop:
             status=source.status[here],
             of_right=of_right,
             status_of_right=status_of_right,
-            **dict(zip(("colour_left", "colour_right"), colours)),
+            **colours,
         )
 
     def arrays(self) -> list[NDArray[Any]]:
@@ -173,14 +167,12 @@ class LabelsKnown:
     def of(
         cls,
         source: SceneStores,
-        here: tuple[slice, slice],
+        here: Slices,
         disparity: NDArray[np.float64],
         building_share: float,
     ) -> LabelsKnown:
         """Of the tile at those rows and columns."""
-        surface_class = np.zeros(disparity.shape, np.uint8)
-        if source.surface_class is not None:
-            surface_class = np.asarray(source.surface_class[here])
+        surface_class = _classes(source, here)
         sigma = np.zeros(disparity.shape)
         if source.uncertainty is not None:
             sigma = np.nan_to_num(np.asarray(source.uncertainty[here], np.float64))
@@ -197,6 +189,50 @@ class LabelsKnown:
         return [self.surface_class, self.surface, self.sigma]
 
 
+def tile_layers(source: SceneStores, here: Slices, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """The layers of a tile at those rows and columns, as their files have them."""
+    if not names:
+        return {}
+    known = np.isfinite(np.asarray(source.disparity[here]))
+    values: dict[str, NDArray[Any]] = {}
+    if "class" in names:
+        values["class"] = _classes(source, here)
+    if "lidar_date" in names:
+        dates = source.lidar_date
+        values["lidar_date"] = np.zeros(known.shape) if dates is None else dates[here]
+    if "uncertainty" in names:
+        sigma = source.uncertainty
+        values["uncertainty"] = np.full(known.shape, np.nan) if sigma is None else sigma[here]
+    if "height" in names or "agl" in names:
+        margin = MARGIN_PX if "agl" in names else 0
+        wide = tuple(
+            slice(max(s.start - margin, 0), min(s.stop + margin, n))
+            for s, n in zip(here, source.left.shape)
+        )
+        part = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(here, wide))
+        disparity = np.asarray(source.disparity[wide], np.float32)
+        ground = intersect(source.model, disparity, wide[0].start, wide[1].start)
+        values["height"] = ground[2][part]
+        if "agl" in names:
+            values["agl"] = heights_above_ground(ground, _classes(source, wide))[part]
+    return {name: _stored(name, values[name], known) for name in names}
+
+
+def _classes(source: SceneStores, window: Slices) -> NDArray[np.uint8]:
+    if source.surface_class is None:
+        return np.zeros(source.left[window].shape, np.uint8)
+    return np.asarray(source.surface_class[window])
+
+
+def _stored(name: str, values: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[Any]:
+    """Values as the file has them: nodata where the pixel has no label."""
+    kind = KINDS[name]
+    dtype = np.dtype(kind.dtype)
+    with np.errstate(invalid="ignore"):
+        good = known & np.isfinite(values.astype(np.float64))
+    return np.where(good, values, kind.nodata).astype(dtype)
+
+
 def _finished(
     source: SceneStores, window: Window, names: Mapping[str, str], crop: _Crop, cut: Cut
 ) -> tuple[dict[str, str], TileChecks | None]:
@@ -204,11 +240,7 @@ def _finished(
 
     A tile is taken over if its pixels, what its checks need, names, settings and code are the same.
     """
-    here = (
-        slice(window.row0, window.row0 + cut.size),
-        slice(window.col0, window.col0 + cut.size),
-    )
-    known = None
+    here, known = window.of_left(cut.size), None
     if window.labelled:
         known = LabelsKnown.of(source, here, crop.disparity, cut.building_share)
     layers = tile_layers(source, here, cut.layers) if window.labelled else {}
@@ -229,7 +261,8 @@ def _finished(
     if piece is None:
         _write_images(paths, source, window, crop, cut)
         for name, values in layers.items():
-            write_layer(paths[column(name)], name, values)
+            kind, path = KINDS[name], paths[column(name)]
+            write_tiff(path, values, nodata=kind.nodata, description=kind.description)
         checks = None if known is None else _check(crop, known)
         piece = cut.ledger.put(tile, key, paths, None if checks is None else checks.to_dict())
     found = piece.result
@@ -252,9 +285,7 @@ def write_tile(
     sums, checks = _finished(source, window, files, crop, cut)
     for kind in sums:
         link(cut.work / files[kind], folder / files[kind])
-    height = source.height[
-        window.row0 : window.row0 + cut.size, window.col0 : window.col0 + cut.size
-    ]
+    height = source.height[window.of_left(cut.size)]
     record = orientation(
         source.model,
         source.sensors,
@@ -321,9 +352,7 @@ def _lidar_days(
     day is known; empty where no such day, or none of the image, is."""
     days = np.empty(0, np.uint16)
     if source.lidar_date is not None:
-        rows, cols = known.shape
-        here = slice(window.row0, window.row0 + rows), slice(window.col0, window.col0 + cols)
-        days = np.asarray(source.lidar_date[here])[known]
+        days = np.asarray(source.lidar_date[window.of_left(len(known))])[known]
         days = np.sort(days[days > 0])
     found: dict[str, int | str] = {}
     for view, taken in zip(("left", "right"), source.acquired):

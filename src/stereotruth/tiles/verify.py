@@ -11,9 +11,7 @@ from ..core.errors import InputError
 from ..core.products.files import read_json
 from ..core.products.folders import is_foreign
 from ..core.products.provenance import file_sha256, own_digest
-from .footprints import FOOTPRINTS, STYLE
-from .manifest import read_manifest
-from .quick_looks import STATUS_COLOURS_FILE
+from .manifest import FOOTPRINTS, STATUS_COLOURS_FILE, STYLE, read_manifest
 
 log = logging.getLogger("stereotruth")
 

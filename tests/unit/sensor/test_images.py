@@ -283,7 +283,7 @@ def test_what_is_no_image_is_refused_by_name(tmp_path, fault) -> None:
     paths = REFUSED[fault](tmp_path)
     with pytest.raises(InputError) as refused, Source(*paths) as source:
         source.check_blocks()
-    assert refused.value.file == tmp_path / "a.tif" and refused.value.remedy
+    assert str(refused.value.file) == str(tmp_path / "a.tif") and refused.value.remedy
 
 
 # ------------------------------------------------------------------ the blocks of a TIFF
