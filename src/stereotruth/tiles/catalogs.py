@@ -111,6 +111,7 @@ def write_stac(
         collection.add_asset(name.partition(".")[0], asset)
     collection.add_items(items)
     collection.normalize_hrefs(str(root))
+    collection.make_asset_hrefs_relative()
     collection.make_all_asset_hrefs_relative()
     collection.save(catalog_type=pystac.CatalogType.SELF_CONTAINED)
     for row in rows:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import struct
-import tracemalloc
 import warnings
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -50,23 +48,7 @@ def holes(path: Path) -> np.ndarray:
     return np.isnan(pixels(path)[0])
 
 
-def test_several_bands(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "rgb.tif"
-    shape = {"width": 9, "height": 8, "count": 3, "dtype": "uint8", "photometric": "RGB"}
-    with (
-        pytest.warns(NotGeoreferencedWarning),
-        rasterio.open(path, "w", driver="GTiff", **shape) as dataset,
-    ):
-        dataset.write(np.full((3, 8, 9), 5, dtype=np.uint8))
-    with caplog.at_level(logging.WARNING, "stereotruth"), Source(path) as source:
-        assert source.size == (9, 8)
-        assert source.read(2, 1, 4, 3).shape == (3, 4)
-    assert "rgb.tif has 3 bands; band 1 (red) is used" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("dtype", "fill"), [("int16", -9999), ("int32", -9999), ("float32", -9999), ("float64", -1e38)]
-)
+@pytest.mark.parametrize(("dtype", "fill"), [("int16", -9999), ("float64", -1e38)])
 def test_undeclared_fill_values_have_no_value(tmp_path, dtype, fill, caplog) -> None:
     """They were valid pixels of 1."""
     values = GREY.astype(dtype)
@@ -80,22 +62,14 @@ def test_undeclared_fill_values_have_no_value(tmp_path, dtype, fill, caplog) -> 
     assert caplog.text.count("taken as nodata; declare its nodata value") == 1
 
 
-def test_noise_of_reflectances_stays(tmp_path) -> None:
-    values = (GREY / 2000).astype(np.float32)
-    values[5, 5] = -0.001
-    got, gain = pixels(write(tmp_path / "a.tif", values))
-    assert np.isfinite(got).all()
-    assert gain == pytest.approx(10000 / values.max())
-
-
 def test_a_hot_pixel_does_not_flatten_the_image(tmp_path, caplog) -> None:
     values = (GREY / 4096).astype(np.float32)
-    values[40, 40] = 3e30
+    values[40, 40], values[5, 5] = 3e30, -0.0001  # a hot pixel, noise
     with caplog.at_level(logging.WARNING, "stereotruth"):
         got, gain = pixels(write(tmp_path / "a.tif", values))
     assert 1000 < np.delete(got.ravel(), 40 * 96 + 40).max() < 15000
     assert got[values < 1e30] == pytest.approx(values[values < 1e30] * gain, rel=1e-6)
-    assert "hot pixels" in caplog.text
+    assert "hot pixels" in caplog.text and np.isfinite(got).all()
 
 
 def test_wide_integers_do_not_saturate(tmp_path) -> None:
@@ -107,22 +81,21 @@ def test_wide_integers_do_not_saturate(tmp_path) -> None:
     assert pixels(write(tmp_path / "b.tif", GREY.astype(dtype)))[1] == 1  # as they are
 
 
-@pytest.mark.parametrize("internal", [True, False])
-def test_what_a_mask_hides_has_no_value(tmp_path, internal) -> None:
+def test_what_a_mask_hides_has_no_value(tmp_path) -> None:
     mask = np.full(GREY.shape, 255, np.uint8)
     mask[3:9, 4:8] = 0
-    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=mask, internal=internal)
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=mask, internal=False)
     np.testing.assert_array_equal(holes(path), mask == 0)
 
 
-@pytest.mark.parametrize("nodata", [None, 5])
-def test_what_is_transparent_has_no_value(tmp_path, nodata) -> None:
+def test_what_is_transparent_has_no_value(tmp_path) -> None:
+    nodata = 5
     values, alpha = GREY.astype(np.uint16), np.full(GREY.shape, 65535, np.uint16)
     alpha[3:9, 4:8] = 0
     values[30, 30] = 5
     path = write(tmp_path / "a.tif", values, alpha, alpha="yes", nodata=nodata)
     expected = alpha == 0
-    expected[30, 30] = nodata is not None
+    expected[30, 30] = True
     np.testing.assert_array_equal(holes(path), expected)
 
 
@@ -154,26 +127,12 @@ def test_what_a_mask_file_hides_is_not_read(tmp_path) -> None:
     np.testing.assert_array_equal(hidden, cloud[5:55, 25:85] > 0)
 
 
-def test_own_mask_and_mask_file_add_up(tmp_path) -> None:
-    own, cloud = np.full(GREY.shape, 255, np.uint8), np.zeros(GREY.shape, np.float32)
-    own[3:9, 4:8], cloud[50:60, 60:70] = 0, 0.5
-    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=own)
-    with Source(path, write(tmp_path / "cloud.tif", cloud)) as source:
-        (values,), hidden = source.read_layers(0, 0, *source.size)
-    np.testing.assert_array_equal(np.isnan(values), own == 0)
-    np.testing.assert_array_equal(hidden, (own == 0) | (cloud > 0))
-
-
-@pytest.mark.parametrize("by", ["alpha", "mask"])
-def test_zeros_that_a_mask_shows_are_values(tmp_path, by) -> None:
+def test_zeros_that_a_mask_shows_are_values(tmp_path) -> None:
     """As shadows in images of 8 bits; of a file without a mask they are nodata."""
     values = GREY.clip(0, 250).astype(np.uint8)
     values[10:30, 20:60], shown = 0, np.full(GREY.shape, 255, np.uint8)
     shown[70:, :] = 0
-    if by == "alpha":
-        path = write(tmp_path / "a.tif", values, shown, alpha="YES")
-    else:
-        path = write(tmp_path / "a.tif", values, mask=shown)
+    path = write(tmp_path / "a.tif", values, mask=shown)
     np.testing.assert_array_equal(holes(path), shown == 0)
     assert holes(write(tmp_path / "b.tif", values))[10:30, 20:60].all()
 
@@ -337,7 +296,7 @@ def test_what_gdal_passes_over_is_found(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("compress", "tag", "value"),
-    [("deflate", 279, 0), ("none", 279, 60), ("none", 258, 1), ("lzw", 259, 1)],  # 0: GDAL: zeros
+    [("deflate", 279, 0), ("none", 258, 1), ("lzw", 259, 1)],  # size 0: GDAL reads zeros
 )
 def test_sizes_that_do_not_go_together(tmp_path, compress, tag, value) -> None:
     path = write(tmp_path / "a.tif", NOISE, compress=compress, blockysize=200)
@@ -372,39 +331,8 @@ def test_two_strips_at_one_place_are_found(tmp_path, compress) -> None:
     assert damaged_block(path) == "blocks 1 and 3 of 4 share bytes"
 
 
-@pytest.mark.slow
-def test_a_block_that_holds_more_than_its_pixels_is_found_in_little_memory(tmp_path) -> None:
-    """A gigabyte of zeros in a megabyte of deflate."""
-    path = write(tmp_path / "a.tif", NOISE, compress="deflate", blockysize=200)
-    packer = zlib.compressobj(9)
-    bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1000)) + packer.flush()
-    data = bytearray(path.read_bytes()) + bomb
-    struct.pack_into("<I", data, entry_of(data, 273) + 8, len(data) - len(bomb))
-    struct.pack_into("<I", data, entry_of(data, 279) + 8, len(bomb))
-    path.write_bytes(data)
-    tracemalloc.start()
-    assert damaged_block(path) != ""
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < 50e6
-
-
 def test_sparse_files_and_other_formats_pass(tmp_path) -> None:
     (path,) = of_shape(300, 300)(tmp_path)
     assert damaged_block(path) == ""
     (tmp_path / "b.png").write_bytes(b"\x89PNG")
     assert damaged_block(tmp_path / "b.png") == ""
-
-
-def test_a_last_strip_that_is_written_in_full_is_no_damage(tmp_path) -> None:
-    path = write(tmp_path / "a.tif", NOISE, blockysize=66)  # the last of four strips has two rows
-    data = path.read_bytes()
-    full, last = 66 * 300 * 2, 2 * 300 * 2
-    kind = next(k for k in "HI" if struct.pack(f"<4{k}", full, full, full, last) in data)
-    sizes = struct.pack(f"<4{kind}", full, full, full, last)
-    path.write_bytes(data.replace(sizes, struct.pack(f"<4{kind}", *[full] * 4)) + bytes(full))
-    assert damaged_block(path) == ""
-    with open_raster(path) as dataset:
-        assert (dataset.read(1) == NOISE).all()
-    path.write_bytes(data.replace(sizes, struct.pack(f"<4{kind}", full, last, full, last)))
-    assert damaged_block(path) != ""

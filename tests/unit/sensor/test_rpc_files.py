@@ -59,51 +59,34 @@ def test_files_written_by_gdal(tmp_path: Path, option: str) -> None:
     assert_same(read_rpc(image), rpc)
 
 
-def spoiled(name: str, old: str, new: str):
-    def change(text: str) -> str:
-        assert old in text
-        return text.replace(old, new, 1)
-
-    return pytest.param(change, id=name)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        spoiled("missing-offset", "LINE_OFF:", "LINE:"),
-        spoiled("missing-coefficient", "SAMP_DEN_COEFF_7:", "SAMP_DEN_7:"),
-        spoiled("not-a-number", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: x"),
-        spoiled("zero-scale", "LAT_SCALE: ", "LAT_SCALE: 0.0 "),
-        spoiled("no-degrees", "LAT_OFF: ", "LAT_OFF: 4796000.0 "),
-        spoiled("empty-value", "HEIGHT_OFF: ", "HEIGHT_OFF:\nX: "),
-        spoiled("underscore", "LINE_SCALE: ", "LINE_SCALE: 1_000\nX: "),
-        spoiled("two-numbers", "LINE_SCALE: ", "LINE_SCALE: 14 "),
-        spoiled("twice", "LINE_SCALE: ", "LINE_SCALE: 14001.0 pixels\nLINE_SCALE: "),
-        spoiled("no-sensor", "HEIGHT_SCALE: ", "HEIGHT_SCALE: -1e30\nX: "),
-        spoiled("huge-term", "LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: 1e30\nX: "),
-        spoiled("long", "LINE_OFF: ", "X: " + "y" * 2_000_000 + "\nLINE_OFF: "),
-    ],
-)
-def test_malformed_text_is_refused(tmp_path: Path, change) -> None:
-    image = write_image(tmp_path / "a.tif", None)
-    (tmp_path / "a_RPC.TXT").write_text(change(rpc_text(make_rpc(15))))
-    with pytest.raises(InputError, match=r"a_RPC.TXT: .*Remedy"):
-        read_rpc(image)
+TEXT_FAULTS = {
+    "missing-offset": ("LINE_OFF:", "LINE:"),
+    "missing-coefficient": ("SAMP_DEN_COEFF_7:", "SAMP_DEN_7:"),
+    "not-a-number": ("LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: x"),
+    "zero-scale": ("LAT_SCALE: ", "LAT_SCALE: 0.0 "),
+    "no-degrees": ("LAT_OFF: ", "LAT_OFF: 4796000.0 "),
+    "empty-value": ("HEIGHT_OFF: ", "HEIGHT_OFF:\nX: "),
+    "two-numbers": ("LINE_SCALE: ", "LINE_SCALE: 14 "),
+    "twice": ("LINE_SCALE: ", "LINE_SCALE: 14001.0 pixels\nLINE_SCALE: "),
+    "huge-term": ("LINE_NUM_COEFF_3: ", "LINE_NUM_COEFF_3: 1e30\nX: "),
+    "long": ("LINE_OFF: ", "X: " + "y" * 2_000_000 + "\nLINE_OFF: "),
+}
+RPB_FAULTS = {
+    "19-coefficients": ("lineNumCoef = (\n", "lineNumCoef = (\n //"),
+    "missing-scale": ("sampScale", "sampScal"),
+    "RPC00A": ("RPC00B", "RPC00A"),
+    "cut-short": ("sampDenCoef = (", "sampDenCoef = "),
+}
+FAULTS = [("a_RPC.TXT", rpc_text, *change) for change in TEXT_FAULTS.values()]
+FAULTS += [("a.rpb", rpb_text, *change) for change in RPB_FAULTS.values()]
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        spoiled("19-coefficients", "lineNumCoef = (\n", "lineNumCoef = (\n //"),
-        spoiled("missing-scale", "sampScale", "sampScal"),
-        spoiled("RPC00A", "RPC00B", "RPC00A"),
-        spoiled("cut-short", "sampDenCoef = (", "sampDenCoef = "),
-    ],
-)
-def test_malformed_rpb_is_refused(tmp_path: Path, change) -> None:
-    image = write_image(tmp_path / "a.tif", None)
-    (tmp_path / "a.rpb").write_text(change(rpb_text(make_rpc(16))))
-    with pytest.raises(InputError, match=r"a.rpb: .*Remedy"):
+@pytest.mark.parametrize(("name", "writer", "old", "new"), FAULTS, ids=[*TEXT_FAULTS, *RPB_FAULTS])
+def test_malformed_files_are_refused(tmp_path: Path, name, writer, old, new) -> None:
+    image, text = write_image(tmp_path / "a.tif", None), writer(make_rpc(15))
+    assert old in text
+    (tmp_path / name).write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=rf"{name}: .*Remedy"):
         read_rpc(image)
 
 

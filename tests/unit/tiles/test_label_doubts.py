@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stereotruth.core.config.labels import Limits
-from stereotruth.tiles import label_doubts
 from stereotruth.tiles.label_doubts import (
     FIGURES,
     Bias,
@@ -14,7 +13,6 @@ from stereotruth.tiles.label_doubts import (
     bias_of,
     doubts,
     flag,
-    location,
     missed,
 )
 
@@ -47,16 +45,6 @@ def found(planted: float, stated: float = 0.01, **made) -> list[Bias]:
         assert bias is not None
         biases.append(bias)
     return biases
-
-
-def test_tails_to_one_side_move_the_location_less_than_the_median():
-    rng = np.random.default_rng(1)
-    errors, _ = matches(rng, cells=200)
-    at, influence, slope = location(errors)
-    assert abs(at) < 0.025
-    assert abs(at) < 0.5 * abs(np.median(errors))
-    assert abs(influence.mean()) < 1e-6
-    assert slope > 0.3 * errors.size
 
 
 @pytest.mark.parametrize("made", [{"cells": 7, "per_cell": 15}, {"shared": 0.06}])
@@ -103,13 +91,6 @@ def test_agreement_is_a_probability_of_all_that_is_judged():
     assert agreement([far]) == pytest.approx(chance)
     assert agreement([far, far]) == pytest.approx(2 * chance)
     assert doubts([far], None) == []
-
-
-def test_equal_values_are_their_own_location():
-    bias = bias_of("roofs", np.full(60, 0.25), np.arange(60) // 6, np.zeros(60))
-    assert bias is not None
-    assert (bias.value, bias.error) == (0.25, 0.0)
-    assert bias.sigma == label_doubts.SIFT_SIGMA_PX
 
 
 # ------------------------------------------------------------------ limits

@@ -175,28 +175,6 @@ def test_the_readers_give_the_same_disparities(written) -> None:
         assert np.corrcoef(a, b)[0, 1] > 0.98
 
 
-def test_images_are_those_of_the_tiles(written) -> None:
-    layout, dataset, out = written
-    ours = {p.name: p for p in StereoDataset("a", dataset, "stereotruth", RANGE).pairs()}
-    for row in rows_of(out)[::5]:
-        left, right = (read_image(out / row[view]) for view in ("left", "right"))
-        one = ours[row["tile"]]
-        images = read_image(one.left), read_image(one.right)
-        if layout == "kitti":
-            shift = int(row["shift_px"])
-            np.testing.assert_array_equal(left, images[0])
-            np.testing.assert_array_equal(right[:, : SIZE - shift], images[1][:, shift:])
-            assert (right[:, SIZE - shift :] == 0).all()
-            continue
-        low, high = float(row["black"]), float(row["white"])
-        for found, image in zip((left, right), images):
-            assert found.shape == (SIZE, SIZE, 3) and found.dtype == np.uint8
-            image = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-            back = low + (found.astype(float) - 1) * (high - low) / 254
-            inside = (image > low) & (image < high)
-            assert np.abs(back - image)[inside].max() <= (high - low) / 254
-
-
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_every_program_opens_them(written, program: str) -> None:
     layout, _, out = written

@@ -113,27 +113,6 @@ def test_a_planted_row_shift_is_found(texture, shift):
         assert figures["sift_matches"] < 30
 
 
-def test_constant_labels_by_hand():
-    disparity = np.zeros((9, 20))
-    disparity[:, 10:] = 0.5
-    assert sift_matches.constant_labels(disparity).all()
-    disparity[:, 10:] = 0.6
-    assert np.array_equal(
-        np.flatnonzero(~sift_matches.constant_labels(disparity)[4]), [8, 9, 10, 11]
-    )
-    disparity[:, 10:] = 0.0
-    disparity[4, 5] = np.nan
-    wanted = np.ones((9, 20), bool)
-    wanted[2:7, 3:8] = False
-    assert np.array_equal(sift_matches.constant_labels(disparity), wanted)
-    sparse = np.where(np.random.default_rng(2).random((200, 200)) < 0.6, 1.0, np.nan)
-    sparse[:, 100:] = np.nan
-    found = sift_matches.constant_labels(sparse)
-    assert 0.4 < found[:, :98].sum() / np.isfinite(sparse[:, :98]).sum() < 0.7
-    assert found[:, 98:].mean() < 0.02
-    assert not found[np.isnan(sparse)].any()
-
-
 def test_images_without_texture_and_tiles_without_labels_give_no_matches(pair):
     flat = np.full((SIZE, SIZE), 500, np.uint16)
     nothing = np.full((SIZE, SIZE), np.nan)

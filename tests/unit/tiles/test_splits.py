@@ -123,21 +123,6 @@ def test_scenes_side_by_side_share_nothing() -> None:
     assert len(overlaps(grid(5, 5, turn=0.0) + nearer)) == 5  # corners do not count
 
 
-def test_whole_groups_are_kept_where_that_costs_less() -> None:
-    """Four clusters of overlapping tiles: runs end between clusters."""
-    places = []
-    for k in range(4):
-        places += [
-            Place("a", k * 4096 + r, c, SIZE, p.ring)
-            for r in (0, 512)
-            for c in (0, 512)
-            for p in grid(1, 1, shift=(c * GSD, -(k * 4096 + r) * GSD), turn=0.0)
-        ]
-    found = split_tiles(places, {"train": 9, "val": 0, "test": 7}, 0)
-    assert found.count("none") == 0
-    assert sorted(found.count(name) for name in ("train", "test")) == [8, 8]
-
-
 def test_all_test_and_none_at_all() -> None:
     assert split_tiles([], weights("Wuhan"), 0) == []
     assert set(split_tiles(grid(2, 3, stride=SIZE // 2), weights("Wuhan"), 0)) == {"test"}

@@ -1,4 +1,4 @@
-"""Tiles against their images: planted errors are flagged, and the evaluation of a city."""
+"""Tiles against their images: planted errors are flagged."""
 
 from __future__ import annotations
 

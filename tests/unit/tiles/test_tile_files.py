@@ -15,7 +15,6 @@ from scipy.ndimage import map_coordinates
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.provenance import file_sha256
 from stereotruth.core.products.rasters import read_image, read_tile, write_tiff
-from stereotruth.epipolar.model import COLOURS
 from stereotruth.tiles.layouts import assemble_dataset, write_layout
 from stereotruth.tiles.manifest import KINDS, NODATA
 from stereotruth.tiles.scene_stores import SceneFiles, open_stores
@@ -118,21 +117,6 @@ def in_colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneFile
     return folder / "Town", scene
 
 
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_every_program_opens_tiles_in_colour(in_colour, program: str) -> None:
-    folder, scene = in_colour
-    stores = {view: zarr.open_group(getattr(scene, view), mode="r") for view in ("left", "right")}
-    row = rows_of(folder)[0]
-    for view, col in (("left", 0), ("right", -int(row["right_offset_px"]))):
-        rows = slice(int(row["row0"]), int(row["row0"]) + SIZE)
-        cols = slice(int(row["col0"]) + col, int(row["col0"]) + col + SIZE)
-        wanted = np.stack([stores[view][name][rows, cols] for name in COLOURS], axis=-1)
-        found = PROGRAMS[program](folder / row[view])
-        if program == "Pillow":
-            wanted = wanted >> 8
-        np.testing.assert_array_equal(found, wanted)
-
-
 def test_tiles_in_colour_are_read_like_others(in_colour, exported: tuple[Path, dict]) -> None:
     """Same windows and labels as of the grey image; the project's readers give both."""
     folder, _ = in_colour
@@ -188,14 +172,6 @@ def test_each_labelled_tile_has_the_layers_that_are_asked_for(tiles):
             with rasterio.open(tiles / file) as source:
                 assert source.dtypes == (KINDS[name].dtype,)
                 assert source.nodata == KINDS[name].nodata
-
-
-def test_nothing_else_of_the_tiles_depends_on_the_layers(tiles, exported):
-    plain = {path.relative_to(exported[0]) for path in exported[0].rglob("*.tiff")}
-    for path in plain:
-        assert (tiles / path).read_bytes() == (exported[0] / path).read_bytes()
-    layers = {path.relative_to(tiles) for path in tiles.rglob("*.tiff")} - plain
-    assert {path.parent.name for path in layers} == set(ALL)
 
 
 def test_heights_are_those_that_the_labels_were_made_of(scene):
