@@ -31,6 +31,7 @@ from typing import NamedTuple
 from ..core.errors import InputError
 from ..core.products.files import read_table
 from ..core.products.names import path_below, plain_name, shown
+from ..core.status import Status
 
 SPLITS = ("train", "val", "test")
 NONE = "none"  # of pairs without labels, and of those that share ground with two splits
@@ -65,6 +66,13 @@ KINDS = {
 def column(name: str) -> str:
     """The manifest's column of a layer's file; ``class`` alone is that of the tile."""
     return f"layer_{name}"
+
+
+def tile_flags(flags: Mapping[int, str]) -> dict[int, str]:
+    """Names of the status values of tiles, from those of their store."""
+    more = Status.LABELLED_CROWN.label in flags.values()
+    added = {int(Status.TOO_UNCERTAIN): Status.TOO_UNCERTAIN.label} if more else {}
+    return dict(flags) | added
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.numerics.degrees import for_readers, metres_per_degree
 
-if TYPE_CHECKING:
-    from ..epipolar.model import EpipolarModel
-
 Floats = NDArray[np.float64]
+Model = (
+    Any  # stereotruth.epipolar.model.EpipolarModel, which whoever reads such a file need not have
+)
 
 
 RING_SIDE = 8  # points of the footprint per side of the tile
@@ -161,7 +161,7 @@ def view_polynomials(
 
 
 def ground_polynomial(
-    model: EpipolarModel,
+    model: Model,
     row0: int,
     col0: int,
     size: int,
@@ -194,7 +194,7 @@ def ground_polynomial(
 
 
 def footprint(
-    model: EpipolarModel, row0: int, col0: int, size: int, height: NDArray[np.floating]
+    model: Model, row0: int, col0: int, size: int, height: NDArray[np.floating]
 ) -> tuple[Floats, Floats]:
     """Ring of a left tile's border on the ground: lon, lat [4 k, 2] in degrees, heights [4 k] in m.
 
@@ -228,7 +228,7 @@ def sensor_record(sensor: Any) -> dict[str, Any]:
 
 
 def orientation(
-    model: EpipolarModel,
+    model: Model,
     sensors: Mapping[str, Mapping[str, Any]],
     *,
     row0: int,
@@ -280,7 +280,7 @@ def orientation(
 
 
 def _recipe(
-    model: EpipolarModel,
+    model: Model,
     views: Mapping[str, Any],
     ground: Mapping[str, Any],
     offset: int,

@@ -29,6 +29,7 @@ from ..core.products.provenance import digest, file_sha256
 from ..core.status import Status
 from ..epipolar.model import COLOURS, EpipolarModel
 from .label_doubts import ALIGNMENT, LIDAR, STRIPS, ToldDoubt
+from .manifest import tile_flags
 from .orientation import sensor_record
 
 MAX_RIGHT_NODATA = 0.01  # share of a right crop; ten columns of a slanted image border
@@ -76,13 +77,6 @@ def tile_labels(store: zarr.Group, flags: Mapping[int, str], limit: float) -> di
     if Status.LABELLED_CROWN.label not in flags.values():
         return {name: store[name] for name in names}
     return {name: SureLabels(store, name, limit) for name in names}
-
-
-def tile_flags(flags: Mapping[int, str]) -> dict[int, str]:
-    """Names of the status values of tiles, from those of their store."""
-    more = Status.LABELLED_CROWN.label in flags.values()
-    added = {int(Status.TOO_UNCERTAIN): Status.TOO_UNCERTAIN.label} if more else {}
-    return dict(flags) | added
 
 
 class Fit(Protocol):

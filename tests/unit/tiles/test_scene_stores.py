@@ -7,7 +7,8 @@ import pytest
 import zarr
 
 from stereotruth.core.status import Status
-from stereotruth.tiles.scene_stores import tile_flags, tile_labels
+from stereotruth.tiles.manifest import tile_flags
+from stereotruth.tiles.scene_stores import tile_labels
 
 FLAGS = {0: "no_points", 1: "labelled", 12: "labelled_crown"}
 
