@@ -17,8 +17,9 @@ from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import COLOURS, EpipolarModel
 from stereotruth.sensor.rpc import RPC, SensorModel
-from stereotruth.tiles.export import City, Extras, export_city
+from stereotruth.tiles.export import Extras, export_city
 from stereotruth.tiles.scene_stores import SceneFiles
+from stereotruth.tiles.tile_files import City
 
 SIZE = 64
 PIXELS = 360  # side of the original images

@@ -8,9 +8,10 @@ from stereotruth.core.config.labels import Export
 from stereotruth.core.job import job
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.making import making
-from stereotruth.tiles.export import City, Extras, export_city
+from stereotruth.tiles.export import Extras, export_city
 from stereotruth.tiles.scene_stores import SceneFiles
 from stereotruth.tiles.tile_checks import summary_lines
+from stereotruth.tiles.tile_files import City
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city

@@ -28,12 +28,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.labels import Export, Limits
+from ..core.config.labels import Export
 from ..core.errors import InputError
 from ..core.job import progress
 from ..core.products.files import atomic_file, atomic_folder, growing_table, write_table
 from ..core.products.provenance import describe, file_sha256, own_digest, source_digest
-from .label_doubts import Doubt, ToldDoubt, doubts, flag, missed, surface_figures
+from .label_doubts import Doubt, doubts, flag, missed, surface_figures
 from .manifest import FOOTPRINTS, NONE, STATUS_COLOURS_FILE, column
 from .orientation import save
 from .quick_looks import (
@@ -63,66 +63,11 @@ from .tile_checks import (
     sigma_by_surface,
     summarise,
 )
-from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
+from .tile_files import FILES, RIGHT_FILES, City, Cut, write_tile
 
 log = logging.getLogger("stereotruth")
 
 SPARSE = 1.0  # LiDAR points in a pixel; with fewer, most windows have too few labels
-
-
-def _refuse_empty(
-    city: str,
-    outcomes: Mapping[str, Mapping[str, int]],
-    size: int,
-    min_labelled: float,
-    sources: Sequence[SceneStores],
-) -> None:
-    lines = [
-        f"scene {scene}: " + ", ".join(f"{count} {what}" for what, count in outcome.items())
-        for scene, outcome in outcomes.items()
-    ]
-    sparse = ", ".join(
-        f"{source.scene} {source.points_per_px:.2g}"
-        for source in sources
-        if source.points_per_px is not None and source.points_per_px < SPARSE
-    )
-    if sparse:
-        sparse = (
-            f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
-            "project.recipe: surface, the default, labels pixels between them"
-        )
-    told = "; ".join(
-        f"the alignment of scene {source.scene} is in doubt: {doubt}"
-        for source in sources
-        for doubt in source.doubts
-    )
-    remedy = (
-        f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now {min_labelled:g}), "
-        f"or LiDAR that covers the overlap of the two images{sparse}"
-    )
-    if told:
-        told = f". Labels are missing where LiDAR and images disagree: {told}"
-        remedy = f"first what the alignment's doubts say; else {remedy}"
-    raise InputError(
-        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){told}",
-        remedy=remedy,
-    )
-
-
-@dataclass(frozen=True)
-class City:
-    """A row of the cities sheet: a name, the prefix of its tiles, and tiles of table 3 by split."""
-
-    city: str
-    prefix: str
-    training: int
-    validation: int
-    testing: int
-
-    @property
-    def split_counts(self) -> dict[str, int]:
-        """Tiles by split, which are scaled to the tiles there are."""
-        return {"train": self.training, "val": self.validation, "test": self.testing}
 
 
 @dataclass(frozen=True)
@@ -233,29 +178,22 @@ def export_city(
         )
     windows = _Windows.of(scenes, settings, workers)
     if not any(window.labelled for _, window in windows.chosen):
-        sources = windows.sources
-        _refuse_empty(city.city, windows.outcomes, settings.size, settings.min_labelled, sources)
+        _refuse_empty(city.city, windows, settings)
     parameters = _parameters(settings, city)
     inputs = {name: value for source in windows.sources for name, value in source.inputs.items()}
     flags = {name: flag for source in windows.sources for name, flag in source.flags.items()}
     cut = Cut(
-        city=city.city,
-        prefix=city.prefix,
-        size=settings.size,
-        dtype=dtype,
-        nodata=nodata,
-        building_share=settings.building_share,
-        limits=settings.quality,
+        city=city,
+        settings=settings,
         code=code or source_digest("stereotruth.tiles.export"),
         flags=dict(sorted(flags.items())),
-        layers=tuple(settings.layers),
         work=out.with_name(f".{out.name}.work") if work is None else Path(work),
         provenance=describe(inputs, parameters, code),
     )
     with extras.being_written() as beside, atomic_folder(out) as scratch:
-        for kind in windows.kinds(cut.layers):
+        for kind in windows.kinds(settings.layers):
             (scratch / kind).mkdir(parents=True)
-        summary, rows = _write_tiles(scratch, windows, cut, beside, parameters, settings, workers)
+        summary, rows = _write_tiles(scratch, windows, cut, beside, parameters, workers)
         record = summary | {
             "manifest_sha256": file_sha256(scratch / "manifest.csv"),
             "footprints_sha256": file_sha256(scratch / FOOTPRINTS),
@@ -264,6 +202,40 @@ def export_city(
         save(scratch / "export.json", record | {"digest": own_digest(record)})
         _forget_others(cut, rows)
     return summary
+
+
+def _refuse_empty(city: str, windows: _Windows, settings: Export) -> None:
+    size, sources = settings.size, windows.sources
+    lines = [
+        f"scene {scene}: " + ", ".join(f"{count} {what}" for what, count in outcome.items())
+        for scene, outcome in windows.outcomes.items()
+    ]
+    sparse = ", ".join(
+        f"{source.scene} {source.points_per_px:.2g}"
+        for source in sources
+        if source.points_per_px is not None and source.points_per_px < SPARSE
+    )
+    if sparse:
+        sparse = (
+            f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
+            "project.recipe: surface, the default, labels pixels between them"
+        )
+    told = "; ".join(
+        f"the alignment of scene {source.scene} is in doubt: {doubt}"
+        for source in sources
+        for doubt in source.doubts
+    )
+    remedy = (
+        f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now "
+        f"{settings.min_labelled:g}), or LiDAR that covers the overlap of the two images{sparse}"
+    )
+    if told:
+        told = f". Labels are missing where LiDAR and images disagree: {told}"
+        remedy = f"first what the alignment's doubts say; else {remedy}"
+    raise InputError(
+        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){told}",
+        remedy=remedy,
+    )
 
 
 def _parameters(settings: Export, city: City) -> dict[str, Any]:
@@ -290,11 +262,10 @@ def _write_tiles(
     cut: Cut,
     beside: tuple[Extras, Any],
     parameters: Mapping[str, Any],
-    settings: Export,
     workers: int,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Write tiles, manifest, footprints and extras; the summary, and the manifest's rows."""
-    extras, table = beside
+    (extras, table), settings = beside, cut.settings
 
     def write(k: int) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
         return write_tile(scratch, *windows.chosen[k], k, cut)
@@ -306,7 +277,7 @@ def _write_tiles(
         if extras.contact_sheet is not None:
             draw_contact_sheet(extras.contact_sheet, city, rows, scratch, settings.nodata)
 
-    city, count = cut.city, len(windows.chosen)
+    city, count = cut.city.city, len(windows.chosen)
     written, scene_checks = [], {s.scene: SceneChecks(s.gcp_rms) for s in windows.sources}
     with ThreadPoolExecutor(workers) as pool:
         tiles = pool.map(write, range(count))
@@ -321,15 +292,14 @@ def _write_tiles(
                     head = {key: row[key] for key in ("city", "scene", "tile", "class")}
                     table.writerows(match_rows(head, checks.matches))
         rows = [row for row, _ in written]
-        splits = _split(written, parameters["split_counts"], settings.seed, settings.strict, city)
+        splits = _split(written, cut.city, settings)
         drawn.append(pool.submit(draw, rows))
         told = {source.scene: source.told for source in windows.sources}
-        gates = _gates(city, rows, scene_checks, told, settings.quality, settings.strict)
+        gates = _gates(city, rows, scene_checks, told, settings)
         for source in windows.sources:
             gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
             gates["scenes"][source.scene]["lidar"] = source.lidar
-        half = settings.disparity_dtype == "float16"
-        summary = summarise(city, rows, splits, windows.phases, windows.outcomes, parameters, half)
+        summary = summarise(city, rows, splits, windows.phases, windows.outcomes, parameters)
         summary["quality"] = gates
         stated = np.sum([checks.stated for checks in scene_checks.values()], axis=0)
         summary["label_uncertainty"] = sigma_by_surface(stated)
@@ -347,7 +317,7 @@ def _forget_others(cut: Cut, rows: Sequence[Mapping[str, Any]]) -> None:
     kept = {
         cut.work / row[kind]
         for row in rows
-        for kind in (*FILES, *RIGHT_FILES, *map(column, cut.layers))
+        for kind in (*FILES, *RIGHT_FILES, *map(column, cut.settings.layers))
         if row.get(kind)
     }
     for file in cut.work.rglob("*.tiff"):
@@ -356,28 +326,25 @@ def _forget_others(cut: Cut, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _split(
-    written: Sequence[tuple[dict[str, Any], NDArray[np.float64]]],
-    weights: Mapping[str, int],
-    seed: int,
-    strict: bool,
-    city: str,
+    written: Sequence[tuple[dict[str, Any], NDArray[np.float64]]], city: City, settings: Export
 ) -> dict[str, Any]:
     """Set the split of every labelled row; wanted and realised counts."""
+    weights = city.split_counts
     labelled = [(row, ring) for row, ring in written if row["complete"] == "yes"]
     places = [
         Place(row["scene"], row["row0"], row["col0"], row["size"], ring) for row, ring in labelled
     ]
-    found = split_tiles(places, weights, seed)
+    found = split_tiles(places, weights, settings.seed)
     for (row, _), split in zip(labelled, found):
         row["split"] = split
     wanted = scaled_counts(len(labelled), weights)
     realised = {name: found.count(name) for name in (*wanted, NONE)}
     if any(realised[name] != count for name, count in wanted.items()):
         problem = (
-            f"{city}: splits of {in_counts(realised)} tiles instead of {in_counts(wanted)}, since "
-            "tiles that share ground must not be in two splits"
+            f"{city.city}: splits of {in_counts(realised)} tiles instead of {in_counts(wanted)}, "
+            "since tiles that share ground must not be in two splits"
         )
-        if strict:
+        if settings.strict:
             raise InputError(problem, remedy="a tiles.stride of tiles.size, or strict: false")
         log.warning("%s", problem)
     return {"wanted": wanted, "realised": realised}
@@ -387,17 +354,16 @@ def _gates(
     city: str,
     rows: Sequence[dict[str, Any]],
     scenes: Mapping[str, SceneChecks],
-    told: Mapping[str, Sequence[ToldDoubt]],
-    limits: Limits,
-    strict: bool,
+    told: Mapping[str, Sequence[Doubt]],
+    settings: Export,
 ) -> dict[str, Any]:
     """Figures, missed gates and doubts of scenes, flagged tiles; sets the doubt of every tile.
 
     ``told``: by scene, what earlier stages have said of it. Logs each miss and what the images
     doubt, or ends a strict run.
     """
-    found, problems = {}, []
-    in_doubt: dict[str, list[Doubt | ToldDoubt]] = {}
+    limits, found, problems = settings.quality, {}, []
+    in_doubt: dict[str, list[Doubt]] = {}
     for scene, checks in scenes.items():
         figures = checks.figures()
         misses = missed(figures, limits)
@@ -414,7 +380,7 @@ def _gates(
             f"tile {row['tile']} of scene {row['scene']}: {miss}"
             for miss in missed(figures, limits)
         ]
-    if problems and strict:
+    if problems and settings.strict:
         more = f"; and {len(problems) - 5} more" if len(problems) > 5 else ""
         raise InputError(
             f"{city}: beyond the limits of quality: {'; '.join(problems[:5])}{more}",

@@ -97,38 +97,21 @@ class Bias:
             "labels_sigma_px": round(self.stated, 4),
         }
 
+    def sentence(self, explained: bool) -> str:
+        """The disagreement in words; ``explained``: what the labels state covers it."""
+        if self.surface == PARALLAX:
+            what = f"rows of left and right differ by {self.value:+.2f} ± {self.sigma:.2f} px"
+        else:
+            value = f"{self.value:+.2f} ± {self.sigma:.2f} px"
+            what = f"images say {value} of the labels of {self.surface}"
+        word = "within" if explained else "more than"
+        return f"{what}, {word} the {self.stated:.2f} px that the alignment states"
+
 
 @dataclass(frozen=True)
 class Doubt:
-    """A disagreement of images and labels; ``explained``: the labels' own uncertainty covers it."""
-
-    bias: Bias
-    explained: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
-        return {
-            "of": self.bias.surface,
-            "text": str(self),
-            "explained_by_alignment": self.explained,
-        }
-
-    def __str__(self) -> str:
-        b = self.bias
-        if b.surface == PARALLAX:
-            what = f"rows of left and right differ by {b.value:+.2f} ± {b.sigma:.2f} px"
-        else:
-            what = f"images say {b.value:+.2f} ± {b.sigma:.2f} px of the labels of {b.surface}"
-        word = "within" if self.explained else "more than"
-        return f"{what}, {word} the {b.stated:.2f} px that the alignment states"
-
-
-@dataclass(frozen=True)
-class ToldDoubt:
-    """What an earlier stage has said of a scene, by its ``sentence``, ``about`` one of ABOUT.
-
-    ``explained``: labels state it in their uncertainty.
-    """
+    """What is doubted of a scene: by its images, ``about`` a surface, or told by earlier stages,
+    ``about`` one of ABOUT; ``explained``: labels state it in their uncertainty."""
 
     about: str
     sentence: str
@@ -245,10 +228,11 @@ def doubts(biases: Iterable[Bias], probability: float | None) -> list[Doubt]:
     judged = [bias for bias in biases if bias.surface in JUDGED]
     found = []
     for bias in judged:
-        if bias.chance(bias.stated) * len(judged) < probability:
-            found.append(Doubt(bias, explained=False))
-        elif bias.chance(0.0) * len(judged) < probability and abs(bias.value) > REMARK_PX:
-            found.append(Doubt(bias, explained=True))
+        unlikely = bias.chance(bias.stated) * len(judged) < probability
+        alone = bias.chance(0.0) * len(judged) < probability and abs(bias.value) > REMARK_PX
+        if unlikely or alone:
+            explained = not unlikely
+            found.append(Doubt(bias.surface, bias.sentence(explained), explained))
     return found
 
 

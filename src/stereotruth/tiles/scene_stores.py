@@ -28,7 +28,7 @@ from ..core.products.grids import require_complete
 from ..core.products.provenance import digest, file_sha256
 from ..core.status import Status
 from ..epipolar.model import COLOURS, EpipolarModel
-from .label_doubts import ALIGNMENT, LIDAR, STRIPS, ToldDoubt
+from .label_doubts import ALIGNMENT, LIDAR, STRIPS, Doubt
 from .manifest import tile_flags
 from .orientation import sensor_record
 
@@ -149,14 +149,14 @@ class SceneStores:
     remark: str
 
     @property
-    def told(self) -> list[ToldDoubt]:
+    def told(self) -> list[Doubt]:
         """What alignment and LiDAR say of what the labels are worth."""
         lidar = self.lidar or {}
-        found = [ToldDoubt(ALIGNMENT, text) for text in self.doubts]
-        found += [ToldDoubt(ALIGNMENT, self.remark, True)] * bool(self.remark)
-        found += [ToldDoubt(LIDAR, text) for text in lidar.get("doubts", ())]
+        found = [Doubt(ALIGNMENT, text) for text in self.doubts]
+        found += [Doubt(ALIGNMENT, self.remark, True)] * bool(self.remark)
+        found += [Doubt(LIDAR, text) for text in lidar.get("doubts", ())]
         if strips := lidar.get("strips"):
-            found += [ToldDoubt(STRIPS, strips["sentence"], True)] * bool(strips["sentence"])
+            found += [Doubt(STRIPS, strips["sentence"], True)] * bool(strips["sentence"])
         return found
 
 

@@ -23,6 +23,8 @@ from .label_surfaces import LabelSurface
 from .sift_matches import FIGURES, SIFT_NOISE_PX, TileMatches
 
 ALONE = (*HIDDEN, Status.OUT_OF_FRAME.label)  # pixels that one image has alone
+SIGMA_COLUMNS = ("uncertainty_median_px", "uncertainty_p95_px")
+CHECK_COLUMNS = (*FIGURES, "warp_correlation", *SIGMA_COLUMNS)
 SIGMA_ENDS_PX = np.geomspace(1e-3, 10.0, 257)  # of the bins in which uncertainties are counted
 
 
@@ -52,7 +54,7 @@ def sigma_figures(counts: NDArray[np.int64]) -> dict[str, int | float | None]:
     }
 
 
-def sigma_by_surface(counts: NDArray[np.int64]) -> dict[str, dict[str, int | float | None]]:
+def sigma_by_surface(counts: NDArray[np.int64]) -> dict[str, dict[str, Any]]:
     """The same of all labels and by what they lie on, where there are any."""
     by = {"all": counts.sum(axis=0)} | {kind.name.lower(): counts[kind] for kind in LabelSurface}
     return {name: sigma_figures(of) for name, of in by.items() if of.any()}
@@ -158,10 +160,6 @@ def _pooled(stated: NDArray[np.int64]) -> dict[str, Any]:
     return {name: figures[name] for name in SIGMA_COLUMNS}
 
 
-SIGMA_COLUMNS = ("uncertainty_median_px", "uncertainty_p95_px")
-CHECK_COLUMNS = (*FIGURES, "warp_correlation", *SIGMA_COLUMNS)
-
-
 def check_cells(checks: TileChecks | None, limits: Limits) -> dict[str, Any]:
     """Cells of the manifest; empty for pairs without complete labels."""
     if checks is None:
@@ -218,7 +216,6 @@ def summarise(
     phases: Mapping[str, tuple[int, int]],
     outcomes: Mapping[str, Mapping[str, int]],
     parameters: Mapping[str, Any],
-    half: bool,
 ) -> dict[str, Any]:
     """JSON-ready figures of a city's tiles."""
     labelled = [row for row in rows if row["complete"] == "yes"]
@@ -249,7 +246,7 @@ def summarise(
             "meaning": (
                 "16-bit float: at most 1/128 px off below 32 px, 1/64 below 64, 1/32 below 128, "
                 "1/16 from 128 px on"
-                if half
+                if parameters["disparity_dtype"] == "float16"
                 else "32-bit float, rounded to 1/1024 px: at most 1/2048 px off"
             ),
         },

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.labels import Limits
+from ..core.config.labels import Export
 from ..core.errors import InputError
 from ..core.numerics.degrees import turn
 from ..core.products.files import link
@@ -41,21 +41,35 @@ def round_disparity(disparity: NDArray[np.floating], dtype: str) -> NDArray[np.f
     return (np.rint(disparity * STEPS) / STEPS).astype(np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """How the tiles of a city are cut and written."""
+@dataclass(frozen=True)
+class City:
+    """A row of the cities sheet: a name, the prefix of its tiles, and tiles of table 3 by split."""
 
     city: str
     prefix: str
-    size: int
-    dtype: str
-    nodata: float
-    building_share: float
-    limits: Limits
+    training: int
+    validation: int
+    testing: int
+
+    @property
+    def split_counts(self) -> dict[str, int]:
+        """Tiles by split, which are scaled to the tiles there are."""
+        return {"train": self.training, "val": self.validation, "test": self.testing}
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """How the tiles of a city are cut and written.
+
+    ``flags``: meaning of the status values of all scenes; ``work``: where the files of finished
+    tiles wait, with the ledger.
+    """
+
+    city: City
+    settings: Export
     code: str
-    flags: Mapping[int, str]  # meaning of the status values of all scenes
-    layers: tuple[str, ...]  # see tile_layers
-    work: Path  # where the files of finished tiles wait, with the ledger
+    flags: Mapping[int, str]
+    work: Path
     provenance: Mapping[str, Any]
 
     @property
@@ -80,13 +94,13 @@ class _Crop:
 
     @classmethod
     def of(cls, source: SceneStores, window: Window, cut: Cut) -> _Crop:
-        here = window.of_left(cut.size)
+        here = window.of_left(cut.settings.size)
         there = here[0], slice(here[1].start - window.offset, here[1].stop - window.offset)
         disparity = source.disparity[here].astype(np.float64) - window.offset
         of_right = status_of_right = None
         if window.labelled and source.of_right is not None:
             values = source.of_right["disparity"][there].astype(np.float64) - window.offset
-            of_right = round_disparity(values, cut.dtype)
+            of_right = round_disparity(values, cut.settings.disparity_dtype)
             status_of_right = source.of_right["status"][there]
         colours = dict.fromkeys(("colour_left", "colour_right"))
         if source.colours is not None:
@@ -96,7 +110,7 @@ class _Crop:
             left=source.left[here],
             right=source.right[there],
             disparity=disparity,
-            stored=round_disparity(disparity, cut.dtype),
+            stored=round_disparity(disparity, cut.settings.disparity_dtype),
             status=source.status[here],
             of_right=of_right,
             status_of_right=status_of_right,
@@ -141,7 +155,7 @@ def _write_images(
     if not window.labelled:
         return
     meanings = ", ".join(f"{value} {meaning}" for value, meaning in source.flags.items())
-    options = {"nodata": cut.nodata, "half": cut.dtype == "float16"}
+    options = {"nodata": cut.settings.nodata, "half": cut.settings.disparity_dtype == "float16"}
     known = np.isfinite(crop.disparity)
     _write_labels(paths["disp"], np.where(known, crop.stored, np.nan), **options)
     write_tiff(paths["status"], crop.status, description=meanings)
@@ -183,10 +197,6 @@ class LabelsKnown:
             surface=label_surfaces(disparity, sigma, surface_class, buildings.found),
             sigma=sigma,
         )
-
-    def arrays(self) -> list[NDArray[Any]]:
-        """All that the checks of a tile follow from, beside its pixels."""
-        return [self.surface_class, self.surface, self.sigma]
 
 
 def tile_layers(source: SceneStores, here: Slices, names: Sequence[str]) -> dict[str, NDArray[Any]]:
@@ -240,12 +250,15 @@ def _finished(
 
     A tile is taken over if its pixels, what its checks need, names, settings and code are the same.
     """
-    here, known = window.of_left(cut.size), None
+    here, known = window.of_left(cut.settings.size), None
     if window.labelled:
-        known = LabelsKnown.of(source, here, crop.disparity, cut.building_share)
-    layers = tile_layers(source, here, cut.layers) if window.labelled else {}
+        known = LabelsKnown.of(source, here, crop.disparity, cut.settings.building_share)
+    layers = tile_layers(source, here, cut.settings.layers) if window.labelled else {}
     pixels = hashlib.sha256()
-    for array in (*crop.arrays(), *(known.arrays() if known else ()), *layers.values()):
+    arrays = [*crop.arrays(), *layers.values()]
+    if known is not None:  # what the checks follow from, beside the pixels
+        arrays += [known.surface_class, known.surface, known.sigma]
+    for array in arrays:
         pixels.update(array)
     files = {name: path for name, path in names.items() if name != "orientation"}
     paths = {name: cut.work / path for name, path in files.items()}
@@ -253,10 +266,14 @@ def _finished(
         "pixels": pixels.hexdigest(),
         "files": files,
         "flags": [[int(value), meaning] for value, meaning in source.flags.items()],
-        "settings": [cut.dtype, cut.nodata, known.kind if known else ""],
+        "settings": [
+            cut.settings.disparity_dtype,
+            cut.settings.nodata,
+            known.kind if known else "",
+        ],
         "code": cut.code,
     }
-    key, tile = digest(made_of), f"{cut.prefix}_{names['left'].rpartition('_')[2][:-5]}"
+    key, tile = digest(made_of), f"{cut.city.prefix}_{names['left'].rpartition('_')[2][:-5]}"
     piece = cut.ledger.find(tile, key, paths)
     if piece is None:
         _write_images(paths, source, window, crop, cut)
@@ -273,48 +290,48 @@ def write_tile(
     folder: Path, source: SceneStores, window: Window, number: int, cut: Cut
 ) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
     """Put a tile into ``folder``: manifest row (without split), ring on the ground, checks."""
-    name = f"{cut.prefix}_{number}"
+    name = f"{cut.city.prefix}_{number}"
     crop = _Crop.of(source, window, cut)
     known, disparity = np.isfinite(crop.disparity), crop.disparity
-    if any((v == cut.nodata).any() for v in (crop.stored, crop.of_right) if v is not None):
+    if any((v == cut.settings.nodata).any() for v in (crop.stored, crop.of_right) if v is not None):
         raise InputError(
-            f"tile {name} has a true disparity of {cut.nodata:g} px, the value for nodata",
+            f"tile {name} has a true disparity of {cut.settings.nodata:g} px, the value for nodata",
             remedy="set tiles.nodata to a value that no disparity takes",
         )
-    files = tile_names(source, window, number, cut.prefix, cut.layers)
+    files = tile_names(source, window, number, cut.city.prefix, cut.settings.layers)
     sums, checks = _finished(source, window, files, crop, cut)
     for kind in sums:
         link(cut.work / files[kind], folder / files[kind])
-    height = source.height[window.of_left(cut.size)]
+    height = source.height[window.of_left(cut.settings.size)]
     record = orientation(
         source.model,
         source.sensors,
         row0=window.row0,
         col0=window.col0,
-        size=cut.size,
+        size=cut.settings.size,
         offset=window.offset,
         height=height,
         disparity=np.where(known, crop.stored, np.nan),
     )
-    head = {"tile": name, "city": cut.city, "scene": source.scene, "files": files}
+    head = {"tile": name, "city": cut.city.city, "scene": source.scene, "files": files}
     if source.lidar and (frame := source.lidar.get("frame")):
         head["ground_frame"] = frame
     save(folder / files["orientation"], head | record | {"provenance": cut.provenance})
     sums["orientation"] = file_sha256(folder / files["orientation"])
 
     ring = np.array(record["footprint"]["coordinates"][0][:-1])
-    match = np.arange(cut.size) - disparity
-    inside = (match >= -0.5) & (match <= cut.size - 0.5)
+    match = np.arange(cut.settings.size) - disparity
+    inside = (match >= -0.5) & (match <= cut.settings.size - 0.5)
     values = crop.stored[known].astype(np.float64)
     lon, lat = ring.mean(axis=0)
     row = {
         "tile": name,
         "number": number,
-        "city": cut.city,
+        "city": cut.city.city,
         "scene": source.scene,
         "row0": window.row0,
         "col0": window.col0,
-        "size": cut.size,
+        "size": cut.settings.size,
         "right_offset_px": window.offset,
         "complete": "yes" if window.labelled else "no",
         "split": NONE,
@@ -326,19 +343,19 @@ def write_tile(
         "disparity_rounding_px": (
             f"{np.abs(values - disparity[known]).max():.6f}" if values.size else ""
         ),
-        "disparity_nodata": f"{cut.nodata:g}",
+        "disparity_nodata": f"{cut.settings.nodata:g}",
         "lon": f"{turn(lon):.7f}",
         "lat": f"{lat:.7f}",
         **_lidar_days(source, window, known),
         **_light(source),
-        **check_cells(checks, cut.limits),
+        **check_cells(checks, cut.settings.quality),
     }
     for value, meaning in cut.flags.items():
         row[f"count_{meaning}"] = int((crop.status == value).sum())
     for kind in (
         *FILES,
         *(RIGHT_FILES if source.of_right is not None else ()),
-        *map(column, cut.layers),
+        *map(column, cut.settings.layers),
     ):
         row[kind] = files.get(kind, "")
         row[f"{kind}_sha256"] = sums.get(kind, "")
