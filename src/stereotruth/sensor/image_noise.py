@@ -1,25 +1,18 @@
 """Noise of two images of the same ground, images in which it is the same everywhere, their detail.
 
-Noise is not one number. A tone curve makes it several times greater in shadow than in the light,
-and resampling, pan-sharpening and compression leave noise whose neighbours correlate, of which one
-image alone tells too little: it looks like texture that optics have blurred.
+Noise is not one number (docs/explanation/real_sensors.md): it follows the brightness, and its
+neighbours may correlate, of which one image alone tells too little.
 
-1. *By brightness*: the second differences along rows and columns remove all of a plane and most of
-   a texture that optics have blurred (Immerkaer, CVIU 64, 1996). Where an image is flattest, at
-   each brightness, they give the noise but for a factor, which is the same at all.
+1. *By brightness*: second differences along rows and columns (Immerkaer, CVIU 64, 1996), where an
+   image is flattest at each brightness, give the noise but for a factor, the same at all.
 2. *The factor*: parts of the left image are looked for along their rows in the right one. Where the
    ground is flat, noise is all that both images differ by.
 3. *Equal noise*: brightness is counted in standard deviations of the noise, so that it is the same
-   at all places and in all images: a variance-stabilising transformation (Anscombe 1948). Whoever
-   compares two images then needs to know neither their bits nor their tone curve.
-
-The LiDAR has no say, so that more of it changes nothing.
+   at all places and in all images: a variance-stabilising transformation (Anscombe 1948).
 
 The *detail* of an image is what remains of it where shadows and another sun change its brightness:
-each pixel's deviation from the mean of the pixels around it, in standard deviations of these. A
-shadow divides brightness and contrast alike, so that its detail is that of the lit ground; only at
-its edge is it another, and there no value exceeds GREATEST. Noise counts as part of the standard
-deviation: where it is all that an image shows, the detail is near its mean.
+each pixel's deviation from the mean of the pixels around it, in standard deviations of these and of
+the noise. Only at a shadow's edge is it another than on lit ground, by GREATEST at most.
 """
 
 from __future__ import annotations

@@ -8,19 +8,18 @@ TIFF can be held against the file: their places, and the checksums of deflate. S
 from __future__ import annotations
 
 import logging
-import struct
 import threading
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.enums import ColorInterp
+from rasterio.enums import ColorInterp, Compression, Interleaving
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
@@ -318,100 +317,75 @@ def open_pair(
 
 # ------------------------------------------------------------------ the blocks of a TIFF
 
-OFFSETS, COUNTS = (273, 324), (279, 325)  # of strips, of tiles
-WIDTH, HEIGHT, BITS, COMPRESSION, SAMPLES, STRIP_ROWS = 256, 257, 258, 259, 277, 278
-PLANAR, TILE_WIDTH, TILE_HEIGHT = 284, 322, 323
-DEFAULTS = {BITS: 1, COMPRESSION: 1, SAMPLES: 1, PLANAR: 1, STRIP_ROWS: (1 << 32) - 1}
-WANTED = {*OFFSETS, *COUNTS, *DEFAULTS, WIDTH, HEIGHT, TILE_WIDTH, TILE_HEIGHT}
 PART_BYTES = 1 << 20  # that are inflated at once
-MOST_BYTES = 1 << 30  # of a block of which the tags do not say its size
-PLAIN, DEFLATE = 1, (8, 32946)
-TYPES = {1: "u1", 3: "u2", 4: "u4", 16: "u8", 13: "u4", 18: "u8"}
+FARTHEST = 1 << 62  # place in a file; damaged ones may not fit 64 bits
 
 
 def damaged_block(path: Path, workers: int = 1, *, whole: bool = True) -> str:
     """What is wrong with the first strip or tile that is damaged; empty if none is, or no TIFF.
 
-    ``whole``: checksums too, for which all of the file is read.
+    ``whole``: checksums too, for which all of the file is read. Blocks without a place or without
+    bytes are empty: GDAL has nodata there.
     """
-    size, lock = size_of(path), threading.Lock()
-    with open_stream(path, keep=False) as stream:
-        if stream.read(4) not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+    with open_raster(path) as dataset:
+        if dataset.driver != "GTiff":
             return ""
-        stream.seek(0)
-        try:
-            tags = _directory(stream, size)
-        except (ValueError, struct.error) as error:
-            return f"its directory cannot be read ({error})"
-        offsets = next((tags[tag] for tag in OFFSETS if tag in tags), np.empty(0, np.int64))
-        counts = next((tags[tag] for tag in COUNTS if tag in tags), np.empty(0, np.int64))
-        if offsets.size != counts.size:  # files of one strip may leave its size out
-            return ""
-        pixels = _pixel_bytes(tags, offsets.size)
-        compression = int(tags.get(COMPRESSION, [PLAIN])[0])
-        if problem := _misplaced(offsets, counts, size, pixels if compression == PLAIN else None):
-            return problem
-        if compression not in DEFLATE or not whole:
-            return ""
-        most = MOST_BYTES if pixels is None else 2 * int(pixels.max(initial=0)) + PART_BYTES
+        offsets, counts = _places_of_blocks(dataset)
+        least, full = _pixel_bytes(dataset, offsets.size)
+        compression = dataset.compression
+    plain = compression is None
+    if problem := _misplaced(offsets, counts, size_of(path), (least, 2 * full) if plain else None):
+        return problem
+    if compression != Compression.deflate or not whole:
+        return ""
+    most, lock = 2 * full + PART_BYTES, threading.Lock()
+    with open_stream(path, keep=False) as stream, ThreadPoolExecutor(workers) as pool:
 
         def is_whole(k: int) -> bool:
             with lock:
                 stream.seek(int(offsets[k]))
                 block = stream.read(int(counts[k]))
-            return not block or _inflates(block, most)  # blocks without bytes are empty ones
+            return not block or _inflates(block, most)
 
-        with ThreadPoolExecutor(workers) as pool:
-            for k, good in enumerate(pool.map(is_whole, range(offsets.size))):
-                if not good:
-                    pool.shutdown(cancel_futures=True)
-                    return f"block {k + 1} of {offsets.size} is damaged"
+        for k, good in enumerate(pool.map(is_whole, range(offsets.size))):
+            if not good:
+                pool.shutdown(cancel_futures=True)
+                return f"block {k + 1} of {offsets.size} is damaged"
     return ""
 
 
-def _directory(stream: BinaryIO, size: int) -> dict[int, NDArray[np.int64]]:
-    """Whole-number tags of the first image; raises ValueError or struct.error if cut short."""
-    head = stream.read(16)
-    order = {b"II": "<", b"MM": ">"}[head[:2]]
-    big = struct.unpack(order + "H", head[2:4])[0] == 43
-    (start,) = struct.unpack(order + ("Q" if big else "I"), head[8:16] if big else head[4:8])
-    entry, number = (20, "Q") if big else (12, "H")
-    stream.seek(min(start, size))
-    (count,) = struct.unpack(order + number, stream.read(struct.calcsize(number)))
-    entries = stream.read(min(count, 65535) * entry)
-    found = {}
-    for at in range(0, len(entries) - entry + 1, entry):
-        tag, kind = struct.unpack_from(order + "HH", entries, at)
-        (values,) = struct.unpack_from(order + ("Q" if big else "I"), entries, at + 4)
-        if kind not in TYPES or tag not in WANTED:
-            continue
-        dtype = np.dtype(order + TYPES[kind])
-        inline = at + (12 if big else 8)
-        length = values * dtype.itemsize
-        if length <= entry - (inline - at):
-            data = entries[inline : inline + length]
-        else:
-            (place,) = struct.unpack_from(order + ("Q" if big else "I"), entries, inline)
-            if place + length > size:
-                raise ValueError("its list of blocks reaches past the end of the file")
-            stream.seek(place)
-            data = stream.read(length)
-        found[tag] = np.frombuffer(data, dtype).astype(np.int64)
-    return found
+def _places_of_blocks(dataset: rasterio.DatasetReader) -> tuple[NDArray, NDArray]:
+    """Offsets and sizes int64[n] of the strips or tiles in the file, as GDAL has them; else 0."""
+    rows, cols = dataset.block_shapes[0]
+    of_bands = 1 if dataset.interleaving == Interleaving.pixel else dataset.count
+    found = [
+        [
+            min(
+                int(dataset.get_tag_item(f"BLOCK_{what}_{x}_{y}", "TIFF", bidx=band) or 0), FARTHEST
+            )
+            for what in ("OFFSET", "SIZE")
+        ]
+        for band in range(1, of_bands + 1)
+        for y in range(-(-dataset.height // rows))
+        for x in range(-(-dataset.width // cols))
+    ]
+    offsets, counts = np.array(found, np.int64).T
+    return offsets, counts
 
 
-def _pixel_bytes(tags: Mapping[int, NDArray], blocks: int) -> NDArray[np.int64] | None:
-    """Bytes that the pixels of each block take [blocks]; None if the tags do not say."""
-    one = DEFAULTS | {tag: int(values[0]) for tag, values in tags.items() if values.size}
-    if WIDTH not in one or HEIGHT not in one:
-        return None
-    bits = one[BITS] * (one[SAMPLES] if one[PLANAR] == 1 else 1)
-    if TILE_WIDTH in one and TILE_HEIGHT in one:
-        return np.full(blocks, one[TILE_HEIGHT] * -(-one[TILE_WIDTH] * bits // 8))
-    rows = min(one[STRIP_ROWS], one[HEIGHT])
-    strips = -(-one[HEIGHT] // max(rows, 1))
-    at = np.arange(blocks) % max(strips, 1)
-    return np.minimum(rows, one[HEIGHT] - at * rows) * -(-one[WIDTH] * bits // 8)
+def _pixel_bytes(dataset: rasterio.DatasetReader, blocks: int) -> tuple[NDArray[np.int64], int]:
+    """Bytes that the pixels of each block take at least [blocks], and those of a full one.
+
+    Of a last strip, those of its rows alone; some programs write it in full.
+    """
+    rows, cols = dataset.block_shapes[0]
+    bits = 8 * np.dtype(dataset.dtypes[0]).itemsize
+    bits = int(dataset.tags(1, ns="IMAGE_STRUCTURE").get("NBITS", bits))
+    samples = dataset.count if dataset.interleaving == Interleaving.pixel else 1
+    line = -(-cols * bits * samples // 8)
+    across, down = -(-dataset.width // cols), -(-dataset.height // rows)
+    first = np.arange(blocks) // across % down * rows
+    return np.minimum(rows, dataset.height - first) * line, rows * line
 
 
 def _inflates(block: bytes, most: int) -> bool:
@@ -432,24 +406,21 @@ def _inflates(block: bytes, most: int) -> bool:
 
 
 def _misplaced(
-    offsets: NDArray, counts: NDArray, size: int, pixels: NDArray[np.int64] | None
+    offsets: NDArray, counts: NDArray, size: int, limits: tuple[NDArray, int] | None
 ) -> str:
     """What is wrong with the places of blocks in a file of ``size`` bytes; empty if nothing is.
 
-    ``pixels``: bytes of each block, if they are not compressed.
+    ``limits``: least bytes of each block, and most of any, if they are not compressed.
     """
     past = np.flatnonzero((offsets < 0) | (counts < 0) | (counts > size - offsets))
     if past.size:
         return f"block {past[0] + 1} of {offsets.size} reaches past the end of the file"
-    halves = np.flatnonzero((offsets == 0) != (counts == 0))  # empty ones have neither
-    if halves.size:
-        return f"block {halves[0] + 1} of {offsets.size} has a place or a size, but not both"
-    if pixels is not None and pixels.size:
-        most = 2 * pixels.max()  # some programs pad, or write the last strip in full
-        wrong = np.flatnonzero((counts > 0) & ((counts < pixels) | (counts > most)))
+    if limits is not None:
+        least, most = limits
+        wrong = np.flatnonzero((counts > 0) & ((counts < least) | (counts > most)))
         if wrong.size:
             k = wrong[0]
-            return f"block {k + 1} has {counts[k]} bytes, its pixels take {pixels[k]}"
+            return f"block {k + 1} has {counts[k]} bytes, its pixels take {least[k]}"
     used = np.flatnonzero(counts > 0)
     used = used[np.argsort(offsets[used], kind="stable")]
     over = np.flatnonzero((offsets[used] + counts[used])[:-1] > offsets[used[1:]])

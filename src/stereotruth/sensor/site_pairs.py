@@ -3,26 +3,16 @@
 All follows from RPCs and times alone, before anything is matched. The angles are those by which
 pairs are chosen in the field: convergence, elevation of the bisector and asymmetry of both rays
 (Jeong and Kim 2014, ISPRS J. 92; Ames Stereo Pipeline, asp_plot), and the difference of the sun's
-direction, which decides most for pairs of two dates (Qin 2019, ISPRS J. 147).
+direction, which decides most for pairs of two dates (Qin 2019, ISPRS J. 147). Images count as
+diachronic where the shadow of an ordinary building ends elsewhere in them, or where a season lies
+between them (docs/explanation/real_sensors.md).
 
-*Light.* A shadow whose edge has moved is a change of both images and none of the ground. So images
-count as diachronic where the shadow of an ordinary building ends elsewhere in them, or where a
-season lies between them.
-
-*Rank.* By the information about heights that a pixel is expected to give: the share of pixels that
-can be matched, times what a match tells of the height. A match of standard uncertainty
-MATCH_SIGMA_PX tells a height to ``height_sigma_m`` (metres a pixel times that), and so
-½ log₂(1 + (RELIEF_M / height_sigma_m)²) bits of what stands RELIEF_M high (Shannon 1949). Wide
-pairs match less, narrow pairs tell less: the best lie between, at 10 to 30° in most cities.
-
-``matched`` is the share of the pixels that both images show whose disparity semi-global matching
-finds within 1 px. Its log odds fall with the base over the height, with the way of the shadows
-between the images, and with the roughness of the site
-(:func:`stereotruth.lidar.roughness.roughness_m`), as far as its LiDAR has been read. The
-coefficients are fitted, and the prediction is tested on other sites, by ``bench/pairs.py``; the
-ratio of the pixel sizes, the days between the images, their season, the asymmetry and the
-obliqueness of the pair explained nothing beside them there. What the simulated sites lack, clouds,
-snow, haze and what people change, lowers the share of real pairs of dates far apart.
+Pairs rank by the information about heights that a pixel is expected to give: the share of pixels
+that can be matched, times ½ log₂(1 + (RELIEF_M / height_sigma_m)²) bits (Shannon 1949). The log
+odds of a match fall with the base over the height, with the way of the shadows and with the
+roughness of the site (:func:`stereotruth.lidar.roughness.roughness_m`), as far as its LiDAR has
+been read. The coefficients are fitted and tested on other sites by ``bench/pairs.py``
+(docs/stack.md).
 """
 
 from __future__ import annotations
@@ -46,12 +36,7 @@ Names = tuple[str, str]  # of a pair's images
 SAMPLES = 65  # along each side of an image, of the ground that it shares
 DIACHRONIC_DAYS = 30.0  # more than these, as in DiachronicStereo (2026)
 BUILDING_M = 10.0  # height of three storeys
-# Way of the end of that building's shadow between both images, px. In simulated cities of one day
-# under two suns, unchanged pixels called `changed` by the evidence of one light rise by 0.2 % at
-# 0.6 px, 0.7 % at 1.2 px, 1.9 % at 2.2 px, 6.7 % at 7 px where nothing has changed, and by 1.0,
-# 2.1, 3.5 and 8.7 % at 0.8, 1.4, 2.6 and 8 px where much has; by that of two lights by 0.3 and
-# 0.5 % at 8 px. It is also what one label may be off before its images stop to agree.
-SHADOW_PX = 0.5
+SHADOW_PX = 0.5  # way of the end of its shadow; also what a label may be off and its images agree
 # log odds of a wrong match: of a usual site at no base and no way of the shadows; then by each
 WRONG_AT_NOTHING = -2.8
 BY_BASE = 2.2  # per base over height

@@ -1,16 +1,11 @@
 """What images say of labels: doubts about a scene by surface, and limits of tiles and scenes.
 
 Of each surface the location of 'SIFT disparity less label' is found robustly (see
-:func:`location`), with a standard error from the scatter between cells of ``CELL_PX``: matches of
-one cell share their relief, their texture and their points. SIFT itself is off by
-``SIFT_SIGMA_PX``. What the alignment states of the labels is the ``STATED`` quantile of their
-uncertainty there: the noise of the points hardly adds to it.
-
-A disagreement that chance explains too seldom, by all three and Student's t, is a doubt: the labels
-are farther off than they state. One that the alignment's uncertainty does explain, but is
-significant without it and larger than ``REMARK_PX``, is a remark: the labels are honest and could
-be better. Crowns are told, and raise neither. Rows are judged in the same way by the y-parallax,
-which should be zero.
+:func:`location`), with a standard error from the scatter between cells of ``CELL_PX``. A
+disagreement that chance explains too seldom, by that error, what SIFT itself is off and what the
+labels state, is a doubt. One that the labels' uncertainty does explain, but is significant without
+it and larger than ``REMARK_PX``, is a remark (docs/explanation/uncertainty.md). Crowns are told,
+and raise neither. Rows are judged in the same way by the y-parallax, which should be zero.
 
 Limits hold figures that need no truth: residuals of the control points, SIFT matches and image
 warping (section IV of the paper). A tile or scene beyond one is flagged, not dropped.

@@ -296,7 +296,7 @@ def test_what_gdal_passes_over_is_found(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("compress", "tag", "value"),
-    [("deflate", 279, 0), ("none", 258, 1), ("lzw", 259, 1)],  # size 0: GDAL reads zeros
+    [("none", 258, 1), ("lzw", 259, 1)],
 )
 def test_sizes_that_do_not_go_together(tmp_path, compress, tag, value) -> None:
     path = write(tmp_path / "a.tif", NOISE, compress=compress, blockysize=200)
@@ -331,8 +331,24 @@ def test_two_strips_at_one_place_are_found(tmp_path, compress) -> None:
     assert damaged_block(path) == "blocks 1 and 3 of 4 share bytes"
 
 
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_sparse_files_and_other_formats_pass(tmp_path) -> None:
     (path,) = of_shape(300, 300)(tmp_path)
     assert damaged_block(path) == ""
-    (tmp_path / "b.png").write_bytes(b"\x89PNG")
+    picture = {"driver": "PNG", "width": 9, "height": 9, "count": 1, "dtype": "uint8"}
+    with rasterio.open(tmp_path / "b.png", "w", **picture) as dataset:
+        dataset.write(np.ones((1, 9, 9), np.uint8))
     assert damaged_block(tmp_path / "b.png") == ""
+    small = write(tmp_path / "c.tif", NOISE[:10], tiled=True, blockxsize=512, blockysize=256)
+    assert damaged_block(small) == ""
+
+
+def test_a_block_that_lost_its_size_is_nodata(tmp_path) -> None:
+    path = write(tmp_path / "a.tif", NOISE, compress="deflate", blockysize=50)
+    data = bytearray(path.read_bytes())
+    (sizes,) = struct.unpack_from("<I", data, entry_of(data, 279) + 8)
+    kind, width = ("<H", 2) if data[entry_of(data, 279) + 2] == 3 else ("<I", 4)
+    struct.pack_into(kind, data, sizes + width, 0)
+    path.write_bytes(data)
+    assert damaged_block(path) == ""
+    assert np.array_equal(holes(path)[::50, 1], [False, True, False, False])
