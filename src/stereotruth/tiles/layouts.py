@@ -31,7 +31,7 @@ from ..core.products.rasters import (
     write_tiff,
 )
 from ..pages import pictures
-from .manifest import KINDS, NO_TRUTH, NONE, PATHS, SPLITS, TRUTH, column, read_manifest
+from .manifest import KINDS, NO_TRUTH, NONE, PATHS, SPLITS, SUM, TRUTH, column, read_manifest
 from .quick_looks import read_footprints, write_footprints
 from .splits import shared_ground
 
@@ -189,7 +189,9 @@ def _copy(
     folder: Path, row: dict[str, str], place: str, kinds: Sequence[str], scratch: Path
 ) -> dict[str, Any]:
     """Copy one pair and return its row of the dataset's manifest."""
-    row = {k: v for k, v in row.items() if k.partition("_")[0] not in ("status", "orientation")}
+    kept = {*PATHS, *map(column, KINDS)}  # of a tile's files; the others stay in its folder
+    files = {key.removesuffix(SUM) for key in row if key.endswith(SUM)} - kept
+    row = {key: value for key, value in row.items() if key.removesuffix(SUM) not in files}
     for kind in (*PATHS, *(name for name in KINDS if column(name) in row)):
         cell = kind if kind in PATHS else column(kind)
         if kind not in kinds:

@@ -1,10 +1,8 @@
-"""The dataset on hand-made folders, whose files matter alone; other layouts, by several readers."""
+"""The dataset, and its other layouts by several readers."""
 
 from __future__ import annotations
 
-import csv
-import hashlib
-import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -13,7 +11,6 @@ import pytest
 from PIL import Image
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.files import write_table
 from stereotruth.core.products.rasters import read_disparity, read_image
 from stereotruth.tiles.layouts import assemble_dataset, write_layout
 from stereotruth.tiles.stereo_dataset import StereoDataset
@@ -21,131 +18,69 @@ from stereotruth.tiles.verify import defects
 
 from ...synthetic.images import write
 from ...synthetic.other_programs import PROGRAMS
-from ...synthetic.tiled_scene import SIZE, labels, make_scene, rows_of, run
+from ...synthetic.tiled_scene import SIZE, labels, rows_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-SPLITS = ["train", "train", "val", "test", "none", "unlabelled"]
+RANGE = (-64, 200)
 
 
-def make_city(folder: Path, prefix: str, *, east: float = 0.0) -> Path:
-    """A tiles folder with the six tiles of SPLITS, side by side on the ground."""
-    rows = []
-    for n, split in enumerate(SPLITS):
-        complete = split != "unlabelled"
-        group = "" if complete else "unlabelled/"
-        ring = [
-            [115 + east + (n + a) * 0.01, 30 + b * 0.01]
-            for a, b in ((0, 1), (1, 1), (1, 0), (0, 0))
-        ]
-        files = {
-            "left": f"{group}left/{prefix}_left_{n}.tiff",
-            "right": f"{group}right/{prefix}_right_{n}.tiff",
-            "disp": f"disp/{prefix}_disparity_{n}.tiff" if complete else "",
-            "orientation": f"orientation/{prefix}_{n}.json",
-        }
-        row = {
-            "tile": f"{prefix}_{n}",
-            "city": prefix,
-            "scene": prefix,
-            "row0": 0,
-            "col0": 64 * n,
-            "size": 64,
-            "right_offset_px": 0,
-            "complete": "yes" if complete else "no",
-            "split": split if complete else "none",
-            "disparity_rounding_px": "0.0150" if complete else "",
-            "disparity_nodata": "-999",
-        }
-        for kind, name in files.items():
-            row[kind], row[f"{kind}_sha256"] = name, ""
-            if name:
-                path = folder / name
-                path.parent.mkdir(parents=True, exist_ok=True)
-                text = {"footprint": {"coordinates": [[*ring, ring[0]]]}}
-                path.write_text(
-                    json.dumps(text) if kind == "orientation" else f"{name} of {folder}"
-                )
-                row[f"{kind}_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-        rows.append(row)
-    write_table(folder / "manifest.csv", rows)
-    return folder
+def renamed(folder: Path, out: Path) -> Path:
+    """The same tiles as another city, with training and testing exchanged."""
+    shutil.copytree(folder, out)
+    for file in out.rglob("TN_*"):
+        file.rename(file.with_name(file.name.replace("TN_", "AA_")))
+    for file in (out / "manifest.csv", out / "footprints.geojson"):
+        file.write_text(file.read_text().replace("TN_", "AA_"))
+    table = (out / "manifest.csv").read_text()
+    for one, other in ((",train,", ",?,"), (",test,", ",train,"), (",?,", ",test,")):
+        table = table.replace(one, other)
+    (out / "manifest.csv").write_text(table)
+    return out
 
 
-def test_published_layout(tmp_path: Path) -> None:
-    cities = [make_city(tmp_path / "A", "AA"), make_city(tmp_path / "B", "BB", east=1.0)]
-    out = tmp_path / "dataset"
+def test_published_layout(exported, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    cities, out = [exported[0], renamed(exported[0], tmp_path / "B")], tmp_path / "dataset"
     summary = assemble_dataset(cities, out)
-    assert summary["shared_ground"] == []
-    assert summary["pairs"] == {
-        "with ground truth/train": 4,
-        "with ground truth/val": 2,
-        "with ground truth/test": 2,
-        "without ground truth": 2,
-    }
-    names = sorted(p.relative_to(out).as_posix() for p in out.rglob("*.tiff"))
-    assert len(names) == 8 * 3 + 2 * 2
-    assert "with ground truth/train/disp/AA_disparity_0.tiff" in names
-    assert "with ground truth/val/right/BB_right_2.tiff" in names
-    assert "without ground truth/left/AA_left_5.tiff" in names
-    assert not any("_4." in name for name in names)  # split none stays behind
-    assert defects(out) == []
-    with (out / "manifest.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == 10 and "orientation" not in rows[0]
-    assert "0.0150 px" in (out / "README.txt").read_text()
-    # A copy: an edit leaves the tiles alone.
-    (out / names[0]).write_text("edited")
-    assert defects(cities[0]) == [] and defects(cities[1]) == []
-    assert len(defects(out)) == 1
+    given = [row for city in cities for row in rows_of(city)]
+    assert sum(summary["pairs"].values()) == len(given)
+    one, other = summary["shared_ground"][0]
+    assert {one[:2], other[:2]} == {"TN", "AA"} and f"{one} and {other} share" in caplog.text
+    rows = rows_of(out)
+    for row, before in zip(rows, given):
+        place = f"with ground truth/{row['split']}" if row["disp"] else "without ground truth"
+        for kind in ("left", "right", *(("disp",) if row["disp"] else ())):
+            assert row[kind] == f"{place}/{kind}/{Path(before[kind]).name}"
+            assert (out / row[kind]).is_file()
+    assert defects(out) == [] and "orientation" not in rows[0]
+    (out / rows[0]["left"]).write_text("edited")  # a copy: the tiles stay
+    assert defects(cities[0]) == [] and len(defects(out)) == 1
     assemble_dataset(cities, out)  # replaces what was there
     assert defects(out) == []
 
 
-def test_refusals(tmp_path: Path) -> None:
-    city = make_city(tmp_path / "A", "AA")
-    with pytest.raises(InputError, match="AA_0 is in"):
-        assemble_dataset([city, make_city(tmp_path / "B", "AA")], tmp_path / "d")
-    with pytest.raises(InputError, match="no manifest"):
-        assemble_dataset([tmp_path / "nowhere"], tmp_path / "d")
+def test_refusals(exported, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="TN_0 is in"):
+        assemble_dataset([exported[0], exported[0]], tmp_path / "d")
+    city = renamed(exported[0], tmp_path / "A")
     (city / "right" / "AA_right_1.tiff").write_text("edited")
-    with pytest.raises(InputError, match=r"AA_right_1.*not as in its manifest"):
-        assemble_dataset([city], tmp_path / "d")
+    for folder in (tmp_path / "nowhere", city):
+        with pytest.raises(InputError):
+            assemble_dataset([folder], tmp_path / "d")
     assert not (tmp_path / "d").exists() and not list(tmp_path.glob("*.partial"))
-
-
-def test_cities_that_share_ground_are_named(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    cities = [make_city(tmp_path / "A", "AA"), make_city(tmp_path / "B", "BB", east=0.02)]
-    shared = assemble_dataset(cities, tmp_path / "dataset")["shared_ground"]
-    assert ("AA_2", "BB_0") in shared and ("AA_3", "BB_1") in shared and len(shared) == 2
-    assert "AA_2 and BB_0 share ground" in caplog.text
 
 
 # ------------------------------------------------------------------ other layouts
 
 
-RANGE = (-64, 200)
-
-
-@pytest.fixture(scope="module")
-def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder, found = tmp_path_factory.mktemp("dataset"), {}
-    for kind in ("grey", "colour"):
-        scene = make_scene(folder / kind / "s1", bare_from=240, colour=kind == "colour")
-        run([scene], folder / kind / "Town")
-        found[kind] = folder / kind / "dataset"
-        assemble_dataset([folder / kind / "Town"], found[kind])
-    return found
-
-
 @pytest.fixture(scope="module", params=["kitti-grey", "us3d-colour"])
-def written(request, datasets, tmp_path_factory) -> tuple[str, Path, Path]:
+def written(request, exported, in_colour, tmp_path_factory) -> tuple[str, Path, Path]:
     layout, kind = request.param.split("-")
-    out = tmp_path_factory.mktemp("layout") / layout
-    assert write_layout(datasets[kind], out, layout) >= 10
+    folder = tmp_path_factory.mktemp("layout")
+    dataset, out = folder / "dataset", folder / layout
+    assemble_dataset([(exported if kind == "grey" else in_colour)[0]], dataset)
+    assert write_layout(dataset, out, layout) >= 10
     assert defects(out) == []
-    return layout, datasets[kind], out
+    return layout, dataset, out
 
 
 def test_the_readers_give_the_same_disparities(written) -> None:

@@ -24,6 +24,7 @@ from ...synthetic.other_programs import PROGRAMS
 from ...synthetic.pictures import colours_in, read_picture
 from ...synthetic.tiled_scene import SIZE, labels, make_scene, read, rows_of, run, terrain
 
+ALL = ("height", "class", "agl", "uncertainty", "lidar_date")
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
@@ -58,22 +59,20 @@ def test_half_precision_tiff(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def of_both_views(scene: SceneFiles, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tiles with labels of the right view too (here those of the left: only the files matter)."""
-    folder = tmp_path_factory.mktemp("both") / "Town"
-    run([scene._replace(disparity_of_right=scene.disparity)], folder)
+def tiles(scene: SceneFiles, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tiles with all layers, and labels of the right view (those of the left: files matter)."""
+    folder = tmp_path_factory.mktemp("all") / "Town"
+    run([scene._replace(disparity_of_right=scene.disparity)], folder, layers=ALL)
     return folder
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_every_program_opens_the_tiles(
-    of_both_views: Path, scene: SceneFiles, program: str
-) -> None:
+def test_every_program_opens_the_tiles(tiles: Path, scene: SceneFiles, program: str) -> None:
     """What each reads are the values of the scene's stores."""
     left, right, labels_of = (
         zarr.open_group(path, mode="r") for path in (scene.left, scene.right, scene.disparity)
     )
-    for row in rows_of(of_both_views)[::5]:
+    for row in rows_of(tiles)[::5]:
         assert float(row["disparity_rounding_px"] or 0) <= 1 / 2048
         offset = int(row["right_offset_px"])
         rows = slice(int(row["row0"]), int(row["row0"]) + SIZE)
@@ -86,7 +85,7 @@ def test_every_program_opens_the_tiles(
                 wanted[f"disp{end}"] = np.where(np.isfinite(disparity), disparity, -999)
                 wanted[f"status{end}"] = labels_of["status"][window]
         for kind, values in wanted.items():
-            found = PROGRAMS[program](of_both_views / row[kind])
+            found = PROGRAMS[program](tiles / row[kind])
             if kind.startswith("disp"):
                 assert found.dtype == np.float32
                 assert np.abs(found - values).max() <= 1 / 2048
@@ -96,17 +95,14 @@ def test_every_program_opens_the_tiles(
                 assert np.array_equal(found, values)
 
 
-@pytest.fixture(scope="module")
-def in_colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneFiles]:
-    folder = tmp_path_factory.mktemp("colour")
-    scene = make_scene(folder / "Town-1", bare_from=240, colour=True)
-    run([scene], folder / "Town", contact_sheet=folder / "contact.png")
-    return folder / "Town", scene
-
-
 def test_tiles_in_colour_are_read_like_others(in_colour, exported: tuple[Path, dict]) -> None:
     """Same windows and labels as of the grey image; the project's readers give both."""
     folder, _ = in_colour
+    row = rows_of(folder)[0]
+    wanted = read_image(folder / row["left"])
+    for name, program in PROGRAMS.items():
+        found = program(folder / row["left"])
+        np.testing.assert_array_equal(found, wanted >> 8 if name == "Pillow" else wanted)
     for row, grey in zip(rows_of(folder), rows_of(exported[0])):
         for column in ("row0", "col0", "disp_sha256", "split", "sift_matches", "warp_correlation"):
             assert row[column] == grey[column]
@@ -132,16 +128,6 @@ def test_the_papers_16_bits_can_be_chosen(scene: SceneFiles, tmp_path: Path) -> 
 
 
 # ------------------------------------------------------------------ layers
-
-
-ALL = ("height", "class", "agl", "uncertainty", "lidar_date")
-
-
-@pytest.fixture(scope="module")
-def tiles(scene, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("layers") / "Town"
-    run([scene], folder, layers=ALL)
-    return folder
 
 
 def test_each_labelled_tile_has_the_layers_that_are_asked_for(tiles):
