@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from stereotruth.epipolar.surface_windows import correlation_and_expected
 from stereotruth.sensor.image_noise import GREATEST, MEAN, STEPS, NoiseCurve, detail, pair_noise
 
 SIDE = 400
-LEVEL = np.zeros((2, SIDE, SIDE), np.float32)
 SHIFT = 7  # px of disparity
 DISPARITIES = -30, 30
 
@@ -64,20 +62,6 @@ def test_images_of_equal_noise_have_the_same_at_all_brightness() -> None:
     values = np.arange(65536, dtype=np.float32)[None]
     equal = curve.equalised(values)[0]
     assert equal[0] == 0.0 and (equal[1:] > 0.0).all() and (np.diff(equal) >= 0.0).all()
-
-
-def test_expected_correlation_is_that_of_the_same_ground() -> None:
-    """On the average, where there is enough of it."""
-    contrast = 20.0
-    sigma, ground = 10.0, texture(3, contrast)
-    left, right = (noisy(ground, sigma, seed).astype(np.float32) for seed in (4, 5))
-    noise = (sigma**2, sigma**2)
-    found, expected = correlation_and_expected(left, right, LEVEL[0], LEVEL, 9, noise)
-    attenuated = contrast**2 / (contrast**2 + sigma**2)  # Spearman
-    told = np.isfinite(expected)
-    assert told.mean() > 0.9
-    assert expected[told].mean() == pytest.approx(attenuated, abs=0.08)
-    assert found[told].mean() == pytest.approx(expected[told].mean(), abs=0.1)
 
 
 # ------------------------------------------------------------------ detail
