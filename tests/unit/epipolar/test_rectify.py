@@ -37,17 +37,18 @@ def render(sensor: SensorModel, height: float) -> np.ndarray:
 
 
 def run(folder: Path, left: np.ndarray, right: np.ndarray, sensors=None, **options):
-    """Rectify two arrays; returns the model and both images."""
-    sensors = sensors or pair()
-    source = folder / "source"
-    source.mkdir(exist_ok=True)
+    """Rectify two arrays, with masks and bands as :func:`open_pair` takes them; returns the model
+    and both images. ``left_tags``, ``right_tags``: of their files."""
+    sensors, masks = sensors or pair(), options.pop("masks", (None, None))
+    source, bands = folder / "source", options.pop("bands", None)
+    source.mkdir(exist_ok=True, parents=True)
     images = [
         write_image(source / f"{name}.tif", None, pixels, **options.pop(f"{name}_tags", {}))
         for name, pixels in (("left", left), ("right", right))
     ]
     out = [folder / name for name in ("epipolar.json", "left.zarr", "right.zarr")]
     model = fit_epipolar(*sensors, SIZE, SIZE, HEIGHT)
-    with open_pair(*images) as opened:
+    with open_pair(*images, *masks, bands=bands) as opened:
         rectify(*opened, model, *out, **options)
     return model, *(open_grid(path).image.values for path in out[1:])
 
@@ -215,21 +216,15 @@ def test_masks_go_where_their_pixels_go(tmp_path: Path) -> None:
     """A mask hides what any of its pixels has a say in; under a mask file the image stays."""
     sensors, cloud = pair(), np.zeros(SIZE[::-1], np.uint8)
     cloud[200:210, 220:240] = 1
-    pixels = render(sensors[0], HEIGHT)
-    images = [write_image(tmp_path / f"{n}.tif", None, pixels) for n in ("left", "right")]
     mask = write_image(tmp_path / "cloud.tif", None, cloud)
-    model = fit_epipolar(*sensors, SIZE, SIZE, HEIGHT)
-    found = {}
-    for name, given in (("clear", (None, None)), ("masked", (mask, None))):
-        out = [tmp_path / name / n for n in ("epipolar.json", "left.zarr", "right.zarr")]
-        with open_pair(*images, *given) as opened:
-            rectify(*opened, model, *out)
-        found[name] = [open_grid(path) for path in out[1:]]
-    left, right = found["masked"]
+    images = [render(sensors[0], HEIGHT)] * 2
+    model, clear, _ = run(tmp_path / "clear", *images, sensors)
+    run(tmp_path / "masked", *images, sensors, masks=(mask, None))
+    left, right = (open_grid(tmp_path / f"masked/{view}.zarr") for view in ("left", "right"))
     with xr.open_zarr(tmp_path / "masked/left.zarr") as alone:
         np.testing.assert_array_equal(alone["mask"], left.mask)
-    assert "mask" not in right and "mask" not in found["clear"][0]
-    np.testing.assert_array_equal(left.image, found["clear"][0].image)
+    assert "mask" not in right and "mask" not in open_grid(tmp_path / "clear/left.zarr")
+    np.testing.assert_array_equal(left.image, clear)
     col, row = model.epipolar_to_left(*np.indices(model.shape)[::-1])
     inside = (col > 217.1) & (col < 241.9) & (row > 197.1) & (row < 211.9)
     outside = (col < 216.9) | (col > 242.1) | (row < 196.9) | (row > 212.1)
@@ -241,26 +236,18 @@ def test_masks_go_where_their_pixels_go(tmp_path: Path) -> None:
 
 def test_colours_are_rectified_alike(tmp_path: Path) -> None:
     """A colour is what a grey image of its values alone would be; the image is the bands' mix."""
-    sensors = pair()
-    model = fit_epipolar(*sensors, SIZE, SIZE, HEIGHT)
-    grey = render(sensors[0], HEIGHT)
-    bands = [(grey // k).astype(np.uint16) + 1 for k in (1, 2, 3)]
-    stores = {}
-    mix = Rectify(panchromatic={1: 1, 2: 1})
-    for name, pixels, given in (("rgb", np.stack(bands), mix), ("green", bands[1], None)):
-        options = {"photometric": "RGB"} if name == "rgb" else {}
-        images = [write_image(tmp_path / f"{n}.tif", None, pixels, **options) for n in "lr"]
-        out = [tmp_path / name / n for n in ("epipolar.json", "left.zarr", "right.zarr")]
-        with open_pair(*images, bands=given) as opened:
-            rectify(*opened, model, *out)
-        stores[name] = open_grid(out[1])
-    rgb = stores["rgb"]
+    sensors, tags = pair(), {"photometric": "RGB"}
+    bands = [(render(sensors[0], HEIGHT) // k).astype(np.uint16) + 1 for k in (1, 2, 3)]
+    mix = {"bands": Rectify(panchromatic={1: 1, 2: 1}), "left_tags": tags, "right_tags": tags}
+    run(tmp_path / "rgb", *[np.stack(bands)] * 2, sensors, **mix)
+    _, green, _ = run(tmp_path / "green", bands[1], bands[1], sensors)
+    rgb = open_grid(tmp_path / "rgb/left.zarr")
     with xr.open_zarr(tmp_path / "rgb/left.zarr") as alone:
         np.testing.assert_array_equal(alone["green"], rgb.green)
-    np.testing.assert_array_equal(rgb.green, stores["green"].image)
+    np.testing.assert_array_equal(rgb.green, green)
     assert rgb.green.attrs["nodata"] == 0 and rgb.green.attrs["units"] == "1"
     assert rgb.attrs["resampling"]["mix"] == {"band 1": 0.5, "band 2": 0.5}
-    assert "mix" not in stores["green"].attrs["resampling"]
+    assert "mix" not in open_grid(tmp_path / "green/left.zarr").attrs["resampling"]
     mixed = (rgb.red.values.astype(float) + rgb.green.values) / 2
     assert np.abs(mixed - rgb.image).max() <= 1.0
     assert (rgb.red.values > rgb.blue.values)[rgb.image.values > 0].all()

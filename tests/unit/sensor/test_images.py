@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import struct
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -17,25 +16,17 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.products.ungeoreferenced import open_raster
 from stereotruth.sensor.images import Source, bands_of, damaged_block, open_pair
 
-from ...synthetic.images import pattern
+from ...synthetic.images import pattern, write_image
 
 X, Y = np.meshgrid(np.arange(96.0), np.arange(80.0))
 GREY = pattern(X / 2, Y / 2).round()
 
 
 def write(path: Path, *bands: np.ndarray, mask: np.ndarray | None = None, **options) -> Path:
-    rows, cols = bands[0].shape
-    shape = {"width": cols, "height": rows, "count": len(bands), "dtype": bands[0].dtype}
-    with (
-        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=options.pop("internal", True)),
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path, "w", driver="GTiff", **shape, **options) as dataset:
-            for k, band in enumerate(bands, 1):
-                dataset.write(band, k)
-            if mask is not None:
-                dataset.write_mask(mask)
+    write_image(path, None, np.stack(bands), **options)
+    if mask is not None:  # in a file of its own
+        with open_raster(path, "r+") as dataset:
+            dataset.write_mask(mask)
     return path
 
 
@@ -84,7 +75,7 @@ def test_wide_integers_do_not_saturate(tmp_path) -> None:
 def test_what_a_mask_hides_has_no_value(tmp_path) -> None:
     mask = np.full(GREY.shape, 255, np.uint8)
     mask[3:9, 4:8] = 0
-    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=mask, internal=False)
+    path = write(tmp_path / "a.tif", GREY.astype(np.uint16), mask=mask)
     np.testing.assert_array_equal(holes(path), mask == 0)
 
 
