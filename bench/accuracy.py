@@ -36,8 +36,8 @@ from stereotruth.evaluate import labels_against_truth
 from stereotruth.evaluate.epipolar_truth import write_grid_truth
 from stereotruth.evaluate.scene_warping import warp_scene
 from stereotruth.project.project import read_mapping
-from stereotruth.tiles import warped_tile
 from stereotruth.tiles.manifest import labelled_tiles
+from stereotruth.tiles.tile_checks import warp_tile
 
 PROJECT = Path(__file__).resolve().parents[1]
 GOALS = (  # measure of exported tiles: key of a row, lowest, highest, factor to its unit
@@ -280,7 +280,7 @@ def panels(made: Made, folder: Path, count: int) -> list[dict[str, str]]:
         return []
     found = []
     for k, of in enumerate(labelled_tiles(made.tiles, made.scene.scene)):
-        tile = warped_tile.warp_tile(made.tiles, of.row)
+        tile = warp_tile(made.tiles, of.row)
         found.append({"tile": tile.name, "correlation": f"{tile.correlation:.4f}"})
         if k < count:
             draw_panels(tile, folder / f"{tile.name}.png")

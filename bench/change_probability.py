@@ -39,7 +39,6 @@ from real import Pair, Site
 from stereocities.truth import REASONS, TEXTURE
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.status import is_labelled
-from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.labels.change_evidence import Evidence, LabelledWindow, change_evidence
 from stereotruth.labels.change_probability import (
     CHANGED,
@@ -57,6 +56,7 @@ from stereotruth.labels.learned_evidence import LEARNED, learned
 from stereotruth.labels.recipe import lidar_labels
 from stereotruth.labels.window_points import read_window
 from stereotruth.lidar.point_store import WATER_CLASS
+from stereotruth.sensor.image_noise import EQUAL
 
 Bools = NDArray[np.bool_]
 Singles = NDArray[np.float32]

@@ -30,7 +30,7 @@ from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluate.labels_against_truth import CLASSES, WATER
 from stereotruth.pages.pictures import DIFFERENCES, DISPARITIES, NO_VALUE
-from stereotruth.tiles.warped_tile import WarpedTile
+from stereotruth.tiles.tile_checks import WarpedTile
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

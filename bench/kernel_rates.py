@@ -29,7 +29,7 @@ from stereotruth.labels.paper_correlation import correlate
 from stereotruth.labels.pixel_points import Collection
 from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.smooth_maps import PatchedTransform
-from stereotruth.sensor.image_reader import Source
+from stereotruth.sensor.images import Source
 from stereotruth.sensor.rpc import SensorModel
 from stereotruth.sensor.rpc_files import read_rpc
 

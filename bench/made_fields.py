@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from stereotruth.epipolar.image_noise import NoiseCurve, pair_noise
 from stereotruth.labels.change_evidence import LabelledWindow
 from stereotruth.labels.image_patches import read_patch
 from stereotruth.labels.pair_window import PairWindow
 from stereotruth.labels.pixel_labels import Labels
 from stereotruth.labels.scene_inputs import SceneInputs
+from stereotruth.sensor.image_noise import NoiseCurve, pair_noise
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -236,4 +236,4 @@ def in_eight_bits(
         pixels[top - patch.row :, side - patch.col :][: here.shape[0], : here.shape[1]] = here
         patches.append(replace(patch, pixels=pixels))
     window = replace(window, left=patches[0], right=patches[1])
-    return window, pair_noise(*images, inputs.pair.model)
+    return window, pair_noise(*images, inputs.pair.model.disparities())

@@ -3,7 +3,7 @@
 Each pair of a drawn site is rectified by exact sensor models, matched by SGM as the benchmark runs
 it, and held against the exact truth: the share of the pixels that both images show whose disparity
 SGM misses by more than 1 px, or has not at all. The site's roughness is that of a LiDAR of 4
-points/m². ``--fit`` prints the coefficients of epipolar/pair_quality.py from sites of even numbers;
+points/m². ``--fit`` prints the coefficients of sensor/site_pairs.py from sites of even numbers;
 without it, the rank correlation of what is predicted with what is found over sites of odd numbers,
 which no fit has seen: within each site, since pairs are chosen within a site, and over all of them.
 """
@@ -29,11 +29,16 @@ from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.lidar.point_statistics import roughness_m
 from stereotruth.lidar.point_store import open_stores
-from stereotruth.sensor.image_reader import open_pair
-from stereotruth.sensor.pair_quality import USUAL_ROUGHNESS_M, quality_of
+from stereotruth.sensor.images import open_pair
 from stereotruth.sensor.rpc import SensorModel
 from stereotruth.sensor.rpc_files import read_rpc
-from stereotruth.sensor.site_pairs import SiteImage, SitePair, pairs_of_site
+from stereotruth.sensor.site_pairs import (
+    USUAL_ROUGHNESS_M,
+    SiteImage,
+    SitePair,
+    pairs_of_site,
+    quality_of,
+)
 
 SEED = 2026
 SPACING_M = 0.5  # of the LiDAR's points

@@ -33,7 +33,6 @@ from scipy.ndimage import (
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.files import atomic_folder
 from stereotruth.core.status import Status, is_labelled
-from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.labels.change_evidence import LabelledWindow
 from stereotruth.labels.change_probability import change_probability
 from stereotruth.labels.crowns import with_crowns
@@ -44,6 +43,7 @@ from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.labels.window_points import read_window
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import WATER_CLASS
+from stereotruth.sensor.image_noise import EQUAL
 from stereotruth.surface.make_surface import make_surface
 
 Floats = NDArray[np.float64]

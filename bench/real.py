@@ -43,7 +43,7 @@ from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.labels.window_points import read_window
 from stereotruth.sensor.rpc import RPC, SensorModel
 from stereotruth.tiles.sift_matches import match_tile
-from stereotruth.tiles.warped_tile import WarpedTile
+from stereotruth.tiles.tile_checks import WarpedTile
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -48,10 +48,9 @@ from stereotruth.evaluate.closure import PairFiles, closure_of_labels, figures, 
 from stereotruth.labels.project import project_scene
 from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.point_store import open_stores
-from stereotruth.sensor.pair_quality import quality_of
+from stereotruth.sensor.pair_geometry import GroundOfImages
 from stereotruth.sensor.rpc import SensorModel
-from stereotruth.sensor.shown_ground import GroundOfImages
-from stereotruth.sensor.site_pairs import SiteImage, SitePair, pairs_of_site
+from stereotruth.sensor.site_pairs import SiteImage, SitePair, pairs_of_site, quality_of
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import ground_cell
 

@@ -42,7 +42,7 @@ from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
-from stereotruth.sensor.image_reader import open_pair
+from stereotruth.sensor.images import open_pair
 
 VIEWS = ("left", "right")
 SEED = 12  # of the fresh cities, their control points' noise and the faults of images

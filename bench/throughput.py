@@ -40,7 +40,7 @@ from stereotruth.epipolar.rectify import rectify
 from stereotruth.labels.project import project_scene
 from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
-from stereotruth.sensor.image_reader import open_pair
+from stereotruth.sensor.images import open_pair
 
 PROJECT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(stereotruth.__file__).parent

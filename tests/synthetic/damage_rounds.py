@@ -31,7 +31,7 @@ from stereotruth.align.gcp_checks import open_view
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.sensor.image_reader import Source
+from stereotruth.sensor.images import Source
 
 from . import damage
 from .damaged_cases import Case, synthetic_cases

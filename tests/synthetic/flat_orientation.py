@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from stereotruth.core.numerics.geometry import DEGREE_M
-from stereotruth.tiles.orientation import GROUND_TOLERANCE
-from stereotruth.tiles.polynomials import fit
+from stereotruth.tiles.orientation import GROUND_TOLERANCE, fit
 
 GSD, RATIO, LAT = 0.7, 0.62, 30.0  # m, base to height, degrees
 

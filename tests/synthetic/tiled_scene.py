@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import rasterio
@@ -14,11 +15,11 @@ import rasterio
 from stereotruth.core.config.configuration import Export, Limits
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.sensor.colours import COLOURS
+from stereotruth.epipolar.model import COLOURS, EpipolarModel
 from stereotruth.sensor.rpc import RPC, SensorModel
-from stereotruth.tiles.export import City, Extras, export_city
+from stereotruth.tiles.export import Extras, export_city
 from stereotruth.tiles.scene_stores import SceneFiles
+from stereotruth.tiles.tile_files import City
 
 SIZE = 64
 PIXELS = 360  # side of the original images
@@ -68,6 +69,19 @@ def surface(sensor: SensorModel, col: np.ndarray, row: np.ndarray) -> tuple[np.n
         lon, lat = sensor.localize(col, row, height)
         height = terrain(lon, lat)
     return lon, lat, height
+
+
+def rough(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+    """A texture that SIFT likes: waves of 3 to 8 m of all directions."""
+    east, north = (lon - LON) / METRE_LON, (lat - LAT) / METRE_LAT
+    rng = np.random.default_rng(11)
+    grey = np.full(lon.shape, 2000.0)
+    for _ in range(40):
+        angle, length, phase = rng.uniform((0, 3, 0), (np.pi, 8, 2 * np.pi))
+        grey += 70 * np.sin(
+            2 * np.pi / length * (np.cos(angle) * east + np.sin(angle) * north) + phase
+        )
+    return grey
 
 
 @cache
@@ -148,6 +162,12 @@ def make_scene(
         arrays["status"][:] = np.where(known, 1, np.where(inside & (y < bare_from), 4, 0))
     stores = (folder / f"{name}.zarr" for name in ("scene", "left", "right"))
     return SceneFiles(folder.name, *stores)
+
+
+def alignment_notes(*gcp_rms_px: float, warnings: Sequence[str] = ()) -> SimpleNamespace:
+    """What an alignment says of labels: residuals of both views, warnings."""
+    fits = [SimpleNamespace(rms={"after": rms}.get) for rms in gcp_rms_px]
+    return SimpleNamespace(fits=fits, warnings=warnings, refinement={})
 
 
 NO_LIMITS = Limits(**dict.fromkeys(Limits.model_fields))

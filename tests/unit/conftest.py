@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from stereotruth.epipolar import fit
-from stereotruth.epipolar.spline_fit import grow
+from stereotruth.epipolar.fit import grow
 
 GROWN: dict[str, Any] = {}
 

@@ -91,7 +91,7 @@ EDITED = {
     "stereotruth/tiles/export": {"export"},
     "stereotruth/labels/project": {"project", "export"},
     "stereotruth/epipolar/rectify": {"rectify", "project", "export"},
-    "stereotruth/sensor/image_reader": {"refine", "rectify", "project", "export"},
+    "stereotruth/sensor/images": {"refine", "rectify", "project", "export"},
     "stereotruth/align/align": STAGES,
     "stereotruth/surface/facets": {"surface", "project", "export"},
     "stereotruth/lidar/ingest": STAGES - {"align"} | {"ingest", "compare_strips", "surface"},

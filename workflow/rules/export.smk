@@ -50,7 +50,7 @@ rule export:
             "seed": SETTINGS.seed,
             "strict": SETTINGS.strict,
         },
-        code=source_digest("stereotruth.tiles.export"),
+        code=source_digest("stereotruth.tiles.export", "stereotruth.align.aligned_pair"),
     message:
         "Cutting the tiles of {wildcards.city}"
     script:
@@ -108,7 +108,7 @@ rule dataset:
             "acquired": SETTINGS.dataset.acquired,
         },
         layouts=[name for name in SETTINGS.dataset.layouts if name != "whu"],
-        code=source_digest("stereotruth.tiles.published_layout", "stereotruth.tiles.other_layouts"),
+        code=source_digest("stereotruth.tiles.layouts", "stereotruth.tiles.layouts"),
     message:
         "Putting the cities together in the layout of the published dataset"
     script:

@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from stereotruth.sensor.image_files import files_beside
+from stereotruth.sensor.deliveries import files_beside
 
 
 def with_files_beside(scene, view):

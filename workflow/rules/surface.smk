@@ -20,7 +20,7 @@ rule surface:
         runtime=240,
     params:
         sources=upstream("surface"),
-        code=source_digest("stereotruth.surface.make_surface", "stereotruth.sensor.shown_ground"),
+        code=source_digest("stereotruth.surface.make_surface", "stereotruth.sensor.pair_geometry"),
     message:
         "Making the surface of the points of scene {wildcards.scene}"
     script:

@@ -1,8 +1,7 @@
 """All cities' tiles in the layout of the published dataset, and in others."""
 
 from stereotruth.core.products.making import rule_job
-from stereotruth.tiles.other_layouts import write_layout
-from stereotruth.tiles.published_layout import assemble_dataset
+from stereotruth.tiles.layouts import assemble_dataset, write_layout
 
 if __name__ == "__main__":
     dataset, *others = snakemake.output

@@ -6,9 +6,10 @@ from pathlib import Path
 from stereotruth.core.config.configuration import Export
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.making import rule_job
-from stereotruth.tiles.export import City, Extras, export_city
+from stereotruth.tiles.export import Extras, export_city
 from stereotruth.tiles.scene_stores import SceneFiles
-from stereotruth.tiles.summary import summary_lines
+from stereotruth.tiles.tile_checks import summary_lines
+from stereotruth.tiles.tile_files import City
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city
@@ -23,6 +24,7 @@ if __name__ == "__main__":
             given.alignment,
             of_right,
             snakemake.params.acquired,
+            map(Alignment.load, given.alignment),
         )
         made = snakemake.output
         summary = export_city(

@@ -7,7 +7,7 @@ from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.rectify import rectify
-from stereotruth.sensor.image_reader import open_pair
+from stereotruth.sensor.images import open_pair
 
 if __name__ == "__main__":
     scene, given, made = snakemake.wildcards.scene, snakemake.input, snakemake.output

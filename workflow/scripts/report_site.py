@@ -10,7 +10,7 @@ from stereotruth.evaluate.report.site_page import write_site_page
 from stereotruth.lidar.point_statistics import roughness_m
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.pages.page import INDEX
-from stereotruth.sensor.pair_quality import rate
+from stereotruth.sensor.site_pairs import rate
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input

@@ -3,7 +3,7 @@
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums
 from stereotruth.lidar.point_store import open_stores
-from stereotruth.sensor.shown_ground import GroundOfImages
+from stereotruth.sensor.pair_geometry import GroundOfImages
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import ground_cell
 

@@ -32,7 +32,7 @@ from stereotruth.core.products.provenance import digest, file_sha256
 from stereotruth.core.products.rasters import read_image
 from stereotruth.core.products.resumable_grids import Ledger
 from stereotruth.pages.page import way
-from stereotruth.tiles.split_names import SPLITS
+from stereotruth.tiles.manifest import SPLITS
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
 from .page import write_audit

@@ -34,9 +34,8 @@ from numpy.typing import NDArray
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.products.rasters import read_flags
 from stereotruth.core.status import HIDDEN
-from stereotruth.tiles.layer_kinds import column
-from stereotruth.tiles.manifest import Tile
-from stereotruth.tiles.pixel_size import PixelSize
+from stereotruth.tiles.manifest import Tile, column
+from stereotruth.tiles.orientation import PixelSize
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset, match_inside
 
 Bools = NDArray[np.bool_]

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from ..core.numerics.statistics import TUKEY, robust_sigma, tukey_weights
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
-from ..sensor.line_correction import LineCorrection
-from ..sensor.rpc import SensorModel
+from ..sensor.rpc import LineCorrection, SensorModel
 from .align import RPC_TILT
 from .aligned_pair import Alignment, ViewFit, over_the_image
 from .equations import Equations, PairEquations

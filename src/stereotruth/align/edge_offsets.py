@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from ..core.numerics.geometry import metres_per_degree
 from ..core.numerics.statistics import TO_SIGMA
-from ..sensor.image_reader import Source
+from ..sensor.images import Source
 from ..sensor.rpc import SensorModel
 from .roof_edges import RoofEdges
 

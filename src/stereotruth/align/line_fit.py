@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtr
 
 from ..core.numerics.statistics import TUKEY, huber_weights, robust_sigma, tukey_weights
-from ..sensor.line_correction import LineCorrection, line_weights
+from ..sensor.rpc import LineCorrection, line_weights
 from .adjustment import (
     BLUNDER_ODDS,
     FREE,

@@ -23,7 +23,6 @@ from ..lidar.lattice import Footprint
 from ..sensor.pair_geometry import find_overlap, find_rotation
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import read_rpc
-from ..sensor.virtual_points import frame, steps
 from .align import RPC_SHIFT, RPC_TILT
 
 Floats = NDArray[np.float64]

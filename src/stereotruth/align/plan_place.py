@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lidar.point_store import PointStore, query_points
-from ..sensor.image_reader import Source
+from ..sensor.images import Source
 from ..sensor.rpc import SensorModel
 from .adjustment import Estimate, parameters_of
 from .aligned_pair import Alignment, ViewFit, over_the_image

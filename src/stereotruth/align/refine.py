@@ -32,7 +32,7 @@ from ..core.config.configuration import Rectify
 from ..core.errors import InputError
 from ..core.numerics.statistics import robust_sigma
 from ..lidar.point_store import PointStore, open_stores
-from ..sensor.image_reader import Source, open_pair
+from ..sensor.images import Source, open_pair
 from .adjustment import (
     LEAST_SIGMA,
     Estimate,
@@ -357,7 +357,7 @@ def refine(
     Returns the alignment, with the record of what was done in ``refinement``, and the
     observations. It is the one that came, affines and all, if the tie points do not contradict
     it or are too few. Reads a fixed number of places, whatever the scene's size. ``masks``: of
-    both images, see :class:`.image_reader.Source`; ``bands``: which are looked at. ``strict`` makes
+    both images, see :class:`.images.Source`; ``bands``: which are looked at. ``strict`` makes
     warnings errors. ``alone``: no other pair shares an image, whose tie points could help.
 
     Raises InputError if there are neither GCPs nor usable tie points, and the pair is ``alone``.

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
-from ..sensor.line_correction import LineCorrection, of_record, read_correction
-from ..sensor.rpc import RPC, SensorModel
+from ..sensor.rpc import RPC, LineCorrection, SensorModel, of_record, read_correction
 from .align import LARGE_SHIFT
 from .aligned_pair import Alignment, ViewFit
 from .control_points import NoPoints, read_gcps

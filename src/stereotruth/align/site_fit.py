@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.numerics.statistics import huber_weights, robust_sigma, tukey_weights
-from ..sensor.line_correction import LineCorrection
+from ..sensor.rpc import LineCorrection
 from .adjustment import Estimate, Sums, estimate
 from .align import CAREFUL_SIGMA, RPC_SHIFT, RPC_TILT
 from .aligned_pair import ViewFit

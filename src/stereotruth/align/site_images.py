@@ -7,7 +7,7 @@ from datetime import date, datetime
 from pathlib import Path
 
 from ..core.tables import acquisition_time
-from ..sensor.acquisition import Acquisition, by_sheet, read_acquisition
+from ..sensor.deliveries import Acquisition, by_sheet, read_acquisition
 from ..sensor.site_pairs import SiteImage
 from .gcp_checks import open_view
 

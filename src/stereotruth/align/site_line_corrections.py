@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sensor.line_correction import LineCorrection
+from ..sensor.rpc import LineCorrection
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sensor.line_correction import LineCorrection
+from ..sensor.rpc import LineCorrection
 from .adjustment import FREE, MATCHING, Estimate
 from .equations import Equations
 from .line_fit import (

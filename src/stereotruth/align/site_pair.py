@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core.products.files import atomic_file, read_record, sealed
-from ..sensor.line_correction import read_correction
-from ..sensor.rpc import SensorModel
+from ..sensor.rpc import SensorModel, read_correction
 from .aligned_pair import Alignment, GcpResidual, ViewFit, over_the_image
 from .equations import spread_of
 from .site_line_corrections import SiteLines

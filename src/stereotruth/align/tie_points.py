@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..core.numerics.interpolation import SIX_POINT_RADIUS
 from ..core.numerics.statistics import median_and_nmad, robust_sigma
 from ..epipolar.resampling import ANTIALIAS
-from ..sensor.image_reader import Source
+from ..sensor.images import Source
 from ..sensor.rpc import SensorModel
 from .least_squares_matching import least_squares_match, warp_patch
 from .tie_planes import HALF

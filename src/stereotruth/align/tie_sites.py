@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..lidar.point_store import PointStore, query_points
-from ..sensor.image_reader import Source
+from ..sensor.images import Source
 from ..sensor.rpc import SensorModel
 from .tie_planes import GUARDS, HALF, MIN_POINTS, SIDE, Guard, SitePoints
 

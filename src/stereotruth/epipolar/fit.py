@@ -1,11 +1,10 @@
 """Epipolar geometry of a whole scene as one smooth, invertible model.
-
 A pushbroom pair has no single epipolar line per point, but over the height range of a scene its
 epipolar curves pair up so well that two smooth functions describe them: the epipolar row y as a
 function of the left image's (col, row) and as a function of the right image's. They are uniform
 bicubic B-splines on top of an affine part, fitted by least squares so that virtual ground points,
 projected by both sensor models, get equal rows. No image content is used. A correction by line
-is no part of the functions: they map the smooth sensors' positions (:mod:`.line_correction`).
+is no part of the functions: they map the smooth sensors' positions (:mod:`..sensor.rpc`).
 
 - Left: the affine part is a rotation (no mirroring), x is linear along the epipolar direction in
   left px, and d = x_left - x_right increases with height.
@@ -21,31 +20,241 @@ of the upper-left pixel.
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..sensor.pair_geometry import convergence_angle, find_overlap, find_rotation, view_order
-from ..sensor.rpc import SensorModel
-from ..sensor.virtual_points import Points, box_defect, common_box, frame, of_box, of_frames, steps
-from .model import EpipolarModel, ImageModel
-from .spline_fit import grow, y_parallax
-from .spline_kernels import forward_with_slopes
+from ..sensor.pair_geometry import (
+    convergence_angle,
+    find_overlap,
+    find_rotation,
+    frame,
+    steps,
+    view_order,
+)
+from ..sensor.rpc import SensorModel, line_weights
+from .model import EpipolarModel, ImageModel, forward_with_slopes
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
-
+Box = tuple[float, float, float, float]  # lon_min, lat_min, lon_max, lat_max, degrees
+Sizes = tuple[tuple[int, int], tuple[int, int]]  # (cols, rows) px of left and right image
+Models = tuple[ImageModel, ImageModel]  # of left and right image
 
 ACCEPTED_RMS = 0.01  # px; above this over the RPCs' ground box the domain is narrowed
+MAX_DOMAIN = 300_000.0  # px; the largest scenes have some 50 000
+# Weights of the penalties, per coefficient and relative to the mean squared residual (px²).
+# A residual floor of r px can push a free direction by about r / (2 sqrt(ridge)); a real
+# coefficient of c px is biased by at most sqrt(ridge) c / 2. The weakest is taken that keeps the
+# scale of the rows: the RPCs of small images may cover more metres of height than of ground, and
+# the rows would shrink to a tenth, with their residuals.
+RIDGES = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+ROW_SCALE = (0.9, 1.1)  # of the left image
+SCALE_SAMPLES = 500  # places where it is asked
+SMOOTHNESS = 1e-10
+SIZES = (6, 8, 10, 12)  # coefficients per axis, tried in turn
+GOOD_RMS = 0.003  # px; no larger spline is tried below this
+
+
+# ------------------------------------------------------------------ virtual ground points
+
+
+@dataclass(frozen=True)
+class Points:
+    """Virtual points in both images: ground (lon, lat, height) [3, n] and (col, row) [2, n]."""
+
+    ground: Floats
+    left: Floats
+    right: Floats
+
+    @classmethod
+    def at(
+        cls, left: SensorModel, right: SensorModel, lon: Floats, lat: Floats, h: Floats
+    ) -> Points:
+        """Of ground positions that broadcast; those that no image can have are left out."""
+        ground = np.stack([np.ravel(c) for c in np.broadcast_arrays(lon, lat, h)])
+        in_left, in_right = np.array(left.project(*ground)), np.array(right.project(*ground))
+        good = np.isfinite(np.vstack([ground, in_left, in_right])).all(axis=0)
+        return cls(ground[:, good], in_left[:, good], in_right[:, good])
+
+    def __add__(self, other: Points) -> Points:
+        return Points(
+            np.hstack([self.ground, other.ground]),
+            np.hstack([self.left, other.left]),
+            np.hstack([self.right, other.right]),
+        )
+
+
+def of_frames(
+    left: SensorModel, right: SensorModel, sizes: Sizes, heights: Floats, n: int
+) -> Points:
+    """Ground points over both images' frames at the given heights."""
+    found = []
+    for sensor, size in zip((left, right), sizes):
+        col, row = frame(size, n)
+        lon, lat = sensor.localize(col[:, None], row[:, None], heights[None, :])
+        found.append(Points.at(left, right, lon, lat, heights[None, :]))
+    return found[0] + found[1]
+
+
+def of_box(
+    left: SensorModel, right: SensorModel, box: Box, heights: Floats, n: int, inset: float
+) -> Points:
+    """Ground points on a regular grid over a ground box at the given heights."""
+    lon, lat, h = np.meshgrid(
+        steps(box[0], box[2], n, inset), steps(box[1], box[3], n, inset), heights
+    )
+    return Points.at(left, right, lon, lat, h)
+
+
+def common_box(left: SensorModel, right: SensorModel) -> tuple[Box, tuple[float, float]]:
+    """Intersection of both RPCs' ground boxes, and height range."""
+    a, b = np.array(left.rpc.ground_box), np.array(right.rpc.ground_box)
+    b[[0, 2]] += 360.0 * np.round((a[0] + a[2] - b[0] - b[2]) / 720.0)
+    low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:4], b[2:4])
+    heights = (max(a[4], b[4]), min(a[5], b[5]))
+    if heights[0] >= heights[1]:
+        heights = (min(a[4], b[4]), max(a[5], b[5]))
+    return tuple(map(float, (*low, *high))), tuple(map(float, heights))
+
+
+def box_defect(left: SensorModel, right: SensorModel, box: Box, points: Points, n: int) -> str:
+    """Why a ground box cannot carry the fit, or an empty string."""
+    if box[0] >= box[2] or box[1] >= box[3]:
+        return "the RPCs' ground boxes do not overlap"
+    if points.ground.shape[1] < n:
+        return "the RPCs give no finite image coordinates in parts of their ground box"
+    for sensor in (left, right):
+        for values in sensor.rpc.denominators(*points.ground):
+            if values.min() <= 0.0 <= values.max():
+                return "an RPC's denominator vanishes in its ground box"
+    for image in (points.left, points.right):
+        if np.ptp(image, axis=1).max() > MAX_DOMAIN:
+            return f"the RPCs' ground box spans more than {MAX_DOMAIN:.0f} px"
+    return ""
+
+
+# ------------------------------------------------------------------ splines
+
+
+def _design(domain: Box, n: int, image: Floats) -> Floats:
+    """[points, n²] values of the B-splines at image (col, row) [2, points] inside the domain."""
+    across, down = (line_weights(domain[k::2], n, image[k]) for k in range(2))
+    return (down[:, :, None] * across[:, None, :]).reshape(-1, n * n)
+
+
+def _second_differences(n: int) -> Floats:
+    """[2 n (n - 2), n²]: second differences of n × n coefficients along both axes."""
+    one = np.diff(np.eye(n), 2, axis=0)
+    return np.vstack([np.kron(np.eye(n), one), np.kron(one, np.eye(n))])
+
+
+def _domain(image: Floats) -> Box:
+    """Bounds of image points, padded by 2 %, in whole px."""
+    low, high = image.min(axis=1), image.max(axis=1)
+    pad = 0.02 * (high - low) + 2.0
+    low, high = np.floor(low - pad), np.ceil(high + pad)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _solve(design: Floats, target: Floats, *penalties: Floats) -> Floats:
+    """Least squares with penalty rows; rounded, so that the count of threads leaves no trace."""
+    rows = np.vstack([design / np.sqrt(len(target)), *penalties])
+    right = np.zeros(len(rows))
+    right[: len(target)] = target / np.sqrt(len(target))
+    return np.round(np.linalg.lstsq(rows, right, rcond=None)[0], 6)
+
+
+def _fit_images(points: Points, surface: Points, rotation: Floats, n: int, ridge: float) -> Models:
+    """Both image models with n × n coefficients per spline.
+
+    ``points`` make the rows, ``surface`` (at the reference height) the right image's x; ``ridge``
+    draws the left rows to those of the ``rotation``.
+    """
+    homogeneous = np.vstack([surface.right, np.ones(surface.right.shape[1])])
+    wanted = rotation @ np.vstack([surface.left, np.ones(surface.left.shape[1])])
+    affine = np.linalg.lstsq(homogeneous.T, wanted.T, rcond=None)[0].T
+    affine = np.round(affine, 12)
+    left_domain = _domain(np.hstack([points.left, surface.left]))
+    right_domain = _domain(np.hstack([points.right, surface.right]))
+
+    def rows(matrix: Floats, image: Floats) -> Floats:
+        return matrix[:, :2] @ image + matrix[:, 2:]
+
+    left_design = _design(left_domain, n, points.left)
+    right_design = _design(right_domain, n, points.right)
+    smooth = np.sqrt(SMOOTHNESS / n**2) * _second_differences(n)
+    nothing = np.zeros_like(smooth)
+    near = np.sqrt(ridge / n**2) * np.eye(n * n)
+    y = _solve(
+        np.hstack([left_design, -right_design]),
+        rows(affine, points.right)[1] - rows(rotation, points.left)[1],
+        np.hstack([near, np.zeros_like(near)]),
+        np.hstack([smooth, nothing]),
+        np.hstack([nothing, smooth]),
+    ).reshape(2, n, n)
+    x = _solve(
+        _design(right_domain, n, surface.right),
+        wanted[0] - rows(affine, surface.right)[0],
+        smooth * 1e2,
+    ).reshape(n, n)
+    left = ImageModel(rotation, left_domain, y[0])
+    return left, ImageModel(affine, right_domain, y[1], x)
+
+
+def y_parallax(left: ImageModel, right: ImageModel, points: Points) -> Floats:
+    """y_left - y_right in px of virtual points."""
+    return left.forward(*points.left)[1] - right.forward(*points.right)[1]
+
+
+def _slopes(model: ImageModel, col: Floats, row: Floats) -> Floats:
+    """[n, 2, 2]: derivatives of (x, y) by (col, row) at image points [n]."""
+    found = [forward_with_slopes(model.packed, c, r)[2:] for c, r in zip(col, row)]
+    return np.array(found).reshape(-1, 2, 2)
+
+
+def _fit_at_scale(points: Points, surface: Points, rotation: Floats, n: int) -> Models:
+    """Both image models by the weakest of RIDGES that keeps the scale of the left rows."""
+    every = max(points.left.shape[1] // SCALE_SAMPLES, 1)
+    for ridge in RIDGES:
+        models = _fit_images(points, surface, rotation, n, ridge)
+        scales = np.linalg.det(_slopes(models[0], *points.left[:, ::every]))
+        if ROW_SCALE[0] <= scales.min() and scales.max() <= ROW_SCALE[1]:
+            break
+    return models
+
+
+def grow(
+    points: Points, checks: list[Points], surface: Points, rotation: Floats
+) -> tuple[Models, float]:
+    """The smallest spline that is good enough, else the best; with its rms y-parallax in px.
+
+    That is the worst rms of several sets of points that did not make the fit.
+    """
+    best: Models | None = None
+    best_rms = np.inf
+    for n in SIZES:
+        models = _fit_at_scale(points, surface, rotation, n)
+        rms = max(float(np.sqrt(np.mean(y_parallax(*models, check) ** 2))) for check in checks)
+        gain = 1.0 - rms / best_rms
+        if best is None or gain > 0:
+            best, best_rms = models, rms
+        if best_rms <= GOOD_RMS or gain < 0.1:
+            break
+    assert best is not None
+    return best, best_rms
+
+
+# ------------------------------------------------------------------ the model of a pair
 
 
 def _grid(
     left: ImageModel,
     right: ImageModel,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
+    sizes: Sizes,
     points: Points,
     names: tuple[str, str],
 ) -> tuple[int, int, tuple[int, int], tuple[float, float]]:
@@ -83,9 +292,7 @@ def _figures(parallax: Floats) -> dict[str, Any]:
 
 def _scales(model: ImageModel, size: tuple[int, int], name: str) -> list[float]:
     """Smallest and largest scale (epipolar px per image px) of a model over an image's frame."""
-    slopes = np.array(
-        [forward_with_slopes(model.packed, c, r)[2:] for c, r in zip(*frame(size, 17))]
-    ).reshape(-1, 2, 2)
+    slopes = _slopes(model, *frame(size, 17))
     determinants = np.linalg.det(slopes)
     if determinants.min() * determinants.max() <= 0:
         raise InputError(
@@ -95,25 +302,6 @@ def _scales(model: ImageModel, size: tuple[int, int], name: str) -> list[float]:
         )
     values = np.linalg.svd(slopes, compute_uv=False)
     return [round(float(values.min()), 6), round(float(values.max()), 6)]
-
-
-def _report(
-    left: ImageModel,
-    right: ImageModel,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
-    names: tuple[str, str],
-    in_frames: Points,
-    in_box: Points | None,
-) -> dict[str, Any]:
-    """Quality of the image models on points that did not make the fit."""
-    return {
-        "y_parallax_over_fit_box": (
-            None if in_box is None else _figures(y_parallax(left, right, in_box))
-        ),
-        "y_parallax_over_image_footprints": _figures(y_parallax(left, right, in_frames)),
-        "scale_left": _scales(left, sizes[0], names[0]),
-        "scale_right": _scales(right, sizes[1], names[1]),
-    }
 
 
 def _px_per_m(left: ImageModel, right: ImageModel, points: Points, reference: float) -> list[float]:
@@ -173,9 +361,12 @@ def fit_epipolar(
 
     x0, y0, shape, disparities = _grid(*images, sizes, in_frames, names)
     images = images[0].shifted(x0, y0), images[1].shifted(x0, y0)
-    report = _report(*images, sizes, names, check_frames, None if defect else check_box)
     ratio = _px_per_m(*images, check_frames, reference_height)
-    report |= {
+    report = {  # on points that did not make the fit
+        "y_parallax_over_fit_box": None if defect else _figures(y_parallax(*images, check_box)),
+        "y_parallax_over_image_footprints": _figures(y_parallax(*images, check_frames)),
+        "scale_left": _scales(images[0], sizes[0], names[0]),
+        "scale_right": _scales(images[1], sizes[1], names[1]),
         "fit_domain": "image footprints" if defect else "RPC ground box and image footprints",
         "fit_domain_reason": defect or "the ground box is usable",
         "coefficients_per_axis": len(images[0].y_spline),

@@ -1,19 +1,24 @@
-"""Where the two rays of a match meet: from epipolar pixels and disparities to the ground."""
+"""From epipolar pixels to the ground: where two rays meet, where the heights of a grid lie."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import InputError
 from ..core.kernels import inner, kernel
 from ..core.numerics.geometry import DEGREE_M
 from ..sensor.rpc import project_point
-from .model import EpipolarModel
-from .spline_kernels import inverse_point
+from .model import EpipolarModel, inverse_point
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 Floats = NDArray[np.float64]
 
-
+SYSTEM = "EPSG:4979"  # WGS 84: longitude, latitude, ellipsoidal height
 TOLERANCE_M = 1e-5
 FRESH = 64  # px along a row after which the derivatives are taken anew
 DEG = 1.0 / DEGREE_M  # per metre, about
@@ -64,15 +69,9 @@ def _refine(
 
 @kernel
 def _intersect(
-    sensors: Floats,
-    left: Floats,
-    right: Floats,
-    row0: int,
-    col0: int,
-    disparity: NDArray[np.float32],
-    start: Floats,
-    out: Floats,
-) -> None:
+    sensors: Floats, left: Floats, right: Floats, row0: int, col0: int,
+    disparity: NDArray[np.float32], start: Floats, out: Floats,
+) -> None:  # fmt: skip
     """Fill ``out`` [3, h, w] with lon, lat, h of a window of disparities, NaN where there is none.
 
     ``left`` and ``right`` are packed image models. A pixel starts where its neighbour ended: the
@@ -128,8 +127,38 @@ def intersect(
     lon, lat = model.epipolar_to_ground(*centre, model.reference_height)
     start = np.array([float(lon), float(lat), model.reference_height])
     out = np.empty((3, *disparity.shape))
-    sensors = np.stack([model.left.packed(), model.right.packed()])
-    _intersect(
-        sensors, model.left_image.packed, model.right_image.packed, row, col, disparity, start, out
-    )
+    packed = model.sensors, model.left_image.packed, model.right_image.packed
+    _intersect(*packed, row, col, disparity, start, out)
     return out
+
+
+def with_ground(grid: xr.Dataset) -> xr.Dataset:
+    """A grid, or a window of it, with the coordinates ``lon`` and ``lat`` [y, x] of its heights.
+
+    ``grid``: of :func:`stereotruth.core.products.grids.open_grid`, with the array ``height`` (m
+    over the ellipsoid) and the epipolar model in its attributes, as ``results/project`` has them.
+    Degrees, NaN where there is no height; the coordinate ``crs`` holds the system of all three by
+    the CF conventions. All of the window is read: take a part of a large grid by ``isel`` or
+    ``sel`` first. Raises InputError for a grid without heights or model.
+    """
+    import pyproj  # which no other caller of this module needs
+
+    for name, there in (("height", grid), ("epipolar", grid.attrs)):
+        if name not in there:
+            raise InputError(f"a grid without {name!r}", remedy="open a grid of results/project")
+    model = EpipolarModel.from_dict(grid.attrs["epipolar"])
+    height = grid["height"].values.astype(np.float64)
+    x, y = np.meshgrid(grid["x"].values.astype(np.float64), grid["y"].values)
+    if grid.attrs.get("view") == "right":
+        x = x + grid["disparity"].values
+    known = np.isfinite(height) & np.isfinite(x)
+    lon, lat = np.full((2, *height.shape), np.nan)
+    lon[known], lat[known] = model.epipolar_to_ground(x[known], y[known], height[known])
+    names = {"lon": (lon, "longitude", "degrees_east"), "lat": (lat, "latitude", "degrees_north")}
+    coordinates = {
+        name: (("y", "x"), values, {"standard_name": of, "units": units, "grid_mapping": "crs"})
+        for name, (values, of, units) in names.items()
+    }
+    found = grid.assign_coords(coordinates | {"crs": ((), 0, pyproj.CRS(SYSTEM).to_cf())})
+    found["height"] = found["height"].assign_attrs(grid_mapping="crs")
+    return found

@@ -23,11 +23,10 @@ from ..core.numerics.interpolation import SIX_POINT_RADIUS
 from ..core.products.grids import Layer, Strip, blocks
 from ..core.products.provenance import digest, file_sha256, source_digest
 from ..core.products.resumable_grids import BlockStore, resumable_grid
-from ..sensor.acquisition import read_acquisition
-from ..sensor.colours import COLOURS
-from ..sensor.image_reader import Source
+from ..sensor.deliveries import read_acquisition
+from ..sensor.images import Source
 from ..sensor.rpc import SensorModel
-from .model import EpipolarModel, ImageModel
+from .model import COLOURS, EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, resample
 
 log = logging.getLogger("stereotruth")
@@ -44,13 +43,6 @@ MASK = {
     "flag_values": [0, 1],
     "flag_meanings": "seen masked",
 }
-
-
-def _lattice(model: ImageModel, rows: slice, cols: slice, step: int) -> Floats:
-    """Source (col, row) [2, k, l] at every ``step``-th epipolar pixel of a block and past it."""
-    y = np.arange(rows.start, rows.stop + step, step, dtype=np.float64)
-    x = np.arange(cols.start, cols.stop + step, step, dtype=np.float64)
-    return np.stack(model.inverse(x[None, :], y[:, None]))
 
 
 def _lattice_step(model: ImageModel, shape: tuple[int, int]) -> tuple[int, float]:
@@ -119,7 +111,11 @@ def rectify_image(
     names = ("image", *(COLOURS if source.colour else ()))
 
     def window(rows: slice, cols: slice) -> tuple[Floats, list[int]] | None:
-        lattice = _lattice(model, rows, cols, step)
+        """Source (col, row) [2, k, l] at every ``step``-th pixel of a block and past it, and the
+        part of the source that these need; None beside it."""
+        y = np.arange(rows.start, rows.stop + step, step, dtype=np.float64)
+        x = np.arange(cols.start, cols.stop + step, step, dtype=np.float64)
+        lattice = np.stack(model.inverse(x[None, :], y[:, None]))
         bounds = []
         for axis in range(2):
             if not np.isfinite(lattice[axis]).any():

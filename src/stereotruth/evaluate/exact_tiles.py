@@ -25,8 +25,8 @@ from ..core.products.grids import require_complete
 from ..core.products.rasters import write_tiff
 from ..epipolar.model import EpipolarModel
 from ..epipolar.rectify import rectify
-from ..sensor.image_reader import open_pair
-from ..tiles.split_names import SPLITS
+from ..sensor.images import open_pair
+from ..tiles.manifest import SPLITS
 from .epipolar_truth import truth_window
 
 NODATA = -999.0

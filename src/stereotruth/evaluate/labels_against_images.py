@@ -22,10 +22,10 @@ from ..core.products.grids import require_complete
 from ..core.products.rasters import read_tile
 from ..epipolar.warping import CorrelationSum
 from ..pages import pictures
+from ..tiles.label_surfaces import BUILDING, VEGETATION
 from ..tiles.manifest import Tile, read_manifest
 from ..tiles.sift_matches import GROSS_PX
-from ..tiles.tile_classes import BUILDING, VEGETATION
-from ..tiles.warped_tile import warp_tile
+from ..tiles.tile_checks import warp_tile
 from .scene_warping import SceneWarping, warp_scene
 
 Floats = NDArray[np.float64]

@@ -25,8 +25,7 @@ from ..core.products.files import write_json, write_table
 from ..core.products.grids import blocks, open_grid
 from ..core.products.rasters import read_tile
 from ..core.status import carries_label
-from ..tiles.manifest import Tile, labelled_tiles
-from ..tiles.sure_labels import tile_flags
+from ..tiles.manifest import Tile, labelled_tiles, tile_flags
 
 log = logging.getLogger("stereotruth")
 Bools = NDArray[np.bool_]

@@ -32,8 +32,8 @@ from ..core.products.grids import Layer, atomic_store, blocks, create_grid
 from ..core.products.provenance import digest
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..lidar.point_store import VEGETATION_CLASSES, PointStore, open_stores
+from ..sensor.pair_geometry import GroundOfImages
 from ..sensor.rpc import SensorModel
-from ..sensor.shown_ground import GroundOfImages
 from ..surface.facet_values import PixelValues
 from ..surface.raster import PRISM_IN_LEFT, VISIBLE, ProjectedSurface, SeenSurface
 from ..surface.region import SQUARE_BITS, Region

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.numerics.windows import window_sums
-from ..sensor.image_detail import detail
+from ..sensor.image_noise import detail
 
 USABLE, MASKED = 1, 2  # bits
 

@@ -14,7 +14,7 @@ from ..core.numerics.geometry import corners_of_hull
 from ..epipolar.model import EpipolarModel
 from ..lidar.lattice import CELL_DEG, Footprint, cell_key
 from ..lidar.point_store import PointStore
-from ..sensor.virtual_points import frame, inside
+from ..sensor.pair_geometry import frame, inside
 from .scene_inputs import SceneInputs
 
 log = logging.getLogger("stereotruth")

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.status import Status
-from ..epipolar.image_noise import NoiseCurve
 from ..epipolar.warping import warp_rows
+from ..sensor.image_noise import NoiseCurve
 from .image_patches import MASKED, USABLE, Detail, Patch
 from .pixel_labels import Labels
 

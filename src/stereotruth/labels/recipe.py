@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.status import Status
-from ..epipolar.image_noise import EQUAL
+from ..sensor.image_noise import EQUAL
 from ..surface.raster import ProjectedSurface
 from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX, with_reasons

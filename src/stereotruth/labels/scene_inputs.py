@@ -21,15 +21,15 @@ from ..core.products.grids import require_complete
 from ..core.products.provenance import digest
 from ..core.status import Status, statuses_of
 from ..core.tables import acquisition_time
-from ..epipolar.image_noise import NoiseCurve, pair_noise
 from ..epipolar.model import EpipolarModel
 from ..lidar.lattice import LATTICE_DEG
 from ..lidar.point_statistics import points_per_m2
 from ..lidar.point_store import PointStore, open_stores
 from ..lidar.strips import StripOffsets
-from ..sensor.acquisition import Acquisition, by_sheet
-from ..sensor.pair_light import PairLight, pair_light
+from ..sensor.deliveries import Acquisition, by_sheet
+from ..sensor.image_noise import NoiseCurve, pair_noise
 from ..sensor.rpc import RPC
+from ..sensor.site_pairs import PairLight, pair_light
 from ..surface.make_surface import make_surface
 from ..surface.scale import PART
 from ..surface.surface_store import Block, SurfaceStore
@@ -197,7 +197,7 @@ class SceneInputs:
     @cached_property
     def noise(self) -> tuple[NoiseCurve, NoiseCurve]:
         """Of both images of the :attr:`pair`, by brightness."""
-        of_images = pair_noise(*self._pair.images, self._pair.model)
+        of_images = pair_noise(*self._pair.images, self._pair.model.disparities())
         return of_images if self.view == "left" else of_images[::-1]
 
     @cached_property

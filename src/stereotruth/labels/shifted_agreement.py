@@ -1,7 +1,7 @@
 """Do the images agree better at another disparity than at that of the labels?
 
 What has grown, been felled or been raised between LiDAR and images is seen by both images, at
-another disparity. So the detail of both images (:mod:`stereotruth.sensor.image_detail`) is
+another disparity. So the detail of both images (:mod:`stereotruth.sensor.image_noise`) is
 correlated over each pixel's surface at the labels' disparity and at shifted ones, and averaged over
 the surface around it. That is positive evidence: shadows that have moved between the images, or
 noise, lower the correlation at all disparities alike.

@@ -397,8 +397,8 @@ def raster_header(file: Path) -> laspy.LasHeader:
 def sampled_heights(file: Path) -> tuple[float, float] | None:
     """Lowest and highest of some cells all over the raster, in its unit; None where all lack.
 
-    Of a raster of :data:`..core.products.rasters.MOST_CELLS` at most, of all. Raises InputError for values
-    that are no heights.
+    Of a raster of :data:`..core.products.rasters.MOST_CELLS` at most, of all. Raises InputError for
+    values that are no heights.
     """
     with _opened(file) as (values, _):
         height, width = values.dataset.shape

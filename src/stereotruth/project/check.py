@@ -11,7 +11,7 @@ from stereocities.cities import city_of, file_of
 from ..core.errors import InputError, in_number
 from ..core.sheets import Scene
 from ..lidar.frames import Epoch
-from ..tiles.windows import cell_step
+from ..tiles.scene_stores import cell_step
 from .check_scene import Looked, check_scene
 from .expected import check_resources, duration
 from .findings import Findings, Level

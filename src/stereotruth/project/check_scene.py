@@ -27,7 +27,7 @@ from ..epipolar.model import EpipolarModel
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..lidar.ingest import SurveyedFile
 from ..lidar.lattice import FAR, Box, Footprint, apart, refuse_apart
-from ..sensor.image_reader import MAX_PIXELS, Source, bands_of
+from ..sensor.images import MAX_PIXELS, Source, bands_of
 from .check_lidar import check_lidar, check_strips
 from .expected import Nodes, SceneFacts, check_frame, check_labels, pixel_m2
 from .findings import Finding, Findings, Level

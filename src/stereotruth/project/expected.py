@@ -18,7 +18,7 @@ from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.windows import summed_area, window_sums
 from ..epipolar.model import EpipolarModel
 from ..lidar.ingest import SurveyedFile
-from ..tiles.windows import cell_step
+from ..tiles.scene_stores import cell_step
 from .findings import Findings, Level
 
 # Shares of the pixels that both views see which get a label, by recipe, at so many points a pixel:

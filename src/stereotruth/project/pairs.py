@@ -17,10 +17,16 @@ from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..lidar.point_statistics import roughness_m
 from ..lidar.point_store import PointStore
-from ..sensor.linked_images import Links, Names, new_links
-from ..sensor.pair_light import DIACHRONIC_DAYS
-from ..sensor.pair_quality import USUAL_ROUGHNESS_M, RatedPair, rate
-from ..sensor.site_pairs import SitePair
+from ..sensor.site_pairs import (
+    DIACHRONIC_DAYS,
+    USUAL_ROUGHNESS_M,
+    Links,
+    Names,
+    RatedPair,
+    SitePair,
+    new_links,
+    rate,
+)
 from .findings import plain_table, wide
 from .new_project import append_row
 from .project import configured, names_in_pair, read_rows, sheet

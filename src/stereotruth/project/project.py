@@ -42,7 +42,7 @@ from ..lidar.catalogue_list import (
     unlisted_m2,
 )
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
-from ..sensor.acquisition import read_acquisition
+from ..sensor.deliveries import read_acquisition
 
 log = logging.getLogger("stereotruth")
 _PACKAGE = Path(__file__).parents[1]

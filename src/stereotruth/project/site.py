@@ -14,10 +14,8 @@ from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.products.remote_files import bring_image, is_remote
 from ..core.sheets import Image, Scene
-from ..sensor.acquisition import Acquisition, near
-from ..sensor.linked_images import Links, Names
-from ..sensor.site_pairs import SiteImage, pair_of
-from ..sensor.sun import between_suns
+from ..sensor.deliveries import Acquisition, between_suns, near
+from ..sensor.site_pairs import Links, Names, SiteImage, pair_of
 from .findings import Findings, Level
 from .project import names_in_pair, sheet
 

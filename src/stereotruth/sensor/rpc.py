@@ -1,8 +1,14 @@
-"""Rational polynomial camera models (RPC00B) and their affine correction in image space.
+"""Rational polynomial camera models (RPC00B), and their corrections by an affine and by line.
 
 Image coordinates are (col, row) = (sample, line) with (0, 0) at the centre of the upper-left pixel,
 ground coordinates are WGS 84 longitude, latitude in degrees and ellipsoidal height in metres.
 RPC00B and the order of its 20 terms: NGA STDI-0002, Appendix E.
+
+Every line of a pushbroom image is taken at its own time, with its own roll and pitch. The
+correction by line moves a whole line along its columns and across them, for an attitude that
+jitters, which no RPC follows. It is no part of the kernels: they know the smooth sensor, and the
+correction is added where a position in the image itself is asked for. So all polynomials of the
+smooth sensor stay as exact as they are.
 """
 
 from __future__ import annotations
@@ -16,26 +22,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.kernels import inlined, inner, kernel
 from ..core.numerics.geometry import continuous
-from .line_correction import LineCorrection, of_record, read_correction
+from ..core.numerics.interpolation import cubic_weights
 
 Floats = NDArray[np.float64]
 
-
-# Coefficients follow ten offsets and scales in the packed form, the affine follows those.
+# The packed form: ten offsets and scales, coefficients, the affine.
 SAMP_NUM, SAMP_DEN, LINE_NUM, LINE_DEN, AFFINE = 10, 30, 50, 70, 90
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-SCALARS = (
-    "line_off",
-    "samp_off",
-    "lat_off",
-    "long_off",
-    "height_off",
-    "line_scale",
-    "samp_scale",
-    "lat_scale",
-    "long_scale",
-    "height_scale",
-)
 # The largest size that a sensor's offsets (px, degrees, m) and coefficients can have, with a wide
 # margin: an image of 10 million px, of the whole Earth. Old cropping tools leave scales alone, so
 # that normalised image coordinates, and with them numerators, may reach some hundreds.
@@ -50,10 +43,19 @@ LIMITS = {
     "lat_scale": 90.0,
     "long_scale": 360.0,
     "height_scale": 30e3,
-    "coeff": 1e6,
 }
-SMALLEST_SCALE = 1e-9
+LARGEST_COEFFICIENT, SMALLEST_SCALE = 1e6, 1e-9
+SCALARS = tuple(LIMITS)
 VECTORS = ("line_num_coeff", "line_den_coeff", "samp_num_coeff", "samp_den_coeff")
+ROUNDS = 12  # of the inverse by line: each leaves a hundredth where a line is off by 0.01 px a line
+MEANING = (
+    "(col, row)_image = (col, row) + (C(row), R(row)), px, (col, row) being that of RPC and "
+    "affine. C and R are uniform cubic B-splines with n coefficients c[i] on [row_min, row_max]: "
+    "s = (row - row_min) / (row_max - row_min) * (n - 3), i0 = min(floor(s), n - 4), f = s - i0, "
+    "sum over a in 0..3 of w_a(f) c[i0 + a], w_0(f) = (1 - f)^3 / 6, w_1(f) = (3 f^3 - 6 f^2 + 4) "
+    "/ 6, w_2(f) = (-3 f^3 + 3 f^2 + 3 f + 1) / 6, w_3(f) = f^3 / 6; beyond, the value of the "
+    "nearest end"
+)
 
 
 # error_model="numpy" (no exception on division by zero) lets LLVM vectorise the loops, if what they
@@ -240,7 +242,7 @@ class RPC:
                 raise ValueError(f"{name} has {values.size} coefficients instead of 20")
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} holds a coefficient that is not finite")
-            if np.abs(values).max() > LIMITS["coeff"]:
+            if np.abs(values).max() > LARGEST_COEFFICIENT:
                 raise ValueError(f"{name} holds {values[np.abs(values).argmax()]:g}")
             if "_den_" in name and not values.any():
                 raise ValueError(f"{name} is zero throughout")
@@ -269,31 +271,28 @@ class RPC:
         low, high = centre - half, centre + half
         return tuple(float(v) for v in (low[0], low[1], high[0], high[1], low[2], high[2]))
 
-    def denominators(self, lon: ArrayLike, lat: ArrayLike, height: ArrayLike) -> Floats:
+    def denominators(self, lon: Floats, lat: Floats, height: Floats) -> Floats:
         """float64[2, n]: sample and line denominator at n ground points; zero is a pole."""
-        terms = _terms(
-            (np.asarray(lon) - self.long_off) / self.long_scale,
-            (np.asarray(lat) - self.lat_off) / self.lat_scale,
-            (np.asarray(height) - self.height_off) / self.height_scale,
-        )
+        terms = self.terms(lon, lat, height)
         return np.stack([terms @ self.samp_den_coeff, terms @ self.line_den_coeff])
 
-    def packed(self) -> Floats:
-        """float64[90] for kernels: ten offsets and scales in field order, then coefficients.
+    def terms(self, lon: Floats, lat: Floats, height: Floats) -> Floats:
+        """[n, 20]: the monomials of RPC00B at ground points."""
+        x = (lon - self.long_off) / self.long_scale
+        y = (lat - self.lat_off) / self.lat_scale
+        z = (height - self.height_off) / self.height_scale
+        terms = (np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x, y * y, z * z)
+        cubic = (x * y * z, x**3, x * y * y, x * z * z, x * x * y, y**3, y * z * z, x * x * z)
+        return np.stack([*terms, *cubic, y * y * z, z**3], axis=-1)
 
-        Coefficients: sample numerator, denominator, line numerator, denominator. The kernels
-        of this module want ``SensorModel.packed()``.
-        """
+    def packed(self) -> Floats:
+        """float64[90]: what :meth:`SensorModel.packed` begins with."""
         scalars = [getattr(self, name) for name in SCALARS]
-        return np.concatenate(
-            [
-                scalars,
-                self.samp_num_coeff,
-                self.samp_den_coeff,
-                self.line_num_coeff,
-                self.line_den_coeff,
-            ]
+        samp, line = (
+            (self.samp_num_coeff, self.samp_den_coeff),
+            (self.line_num_coeff, self.line_den_coeff),
         )
+        return np.concatenate([scalars, *samp, *line])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists under the field names (those of RPC00B in lower case)."""
@@ -309,12 +308,72 @@ class RPC:
         return cls(**{name: values[name] for name in (*SCALARS, *VECTORS)})
 
 
-def _terms(x: Floats, y: Floats, z: Floats) -> Floats:
-    """The 20 monomials of RPC00B at normalised (L, P, H): [n, 20]."""
-    one = np.ones_like(x)
-    terms = (one, x, y, z, x * y, x * z, y * z, x * x, y * y, z * z)
-    cubic = (x * y * z, x**3, x * y * y, x * z * z, x * x * y, y**3, y * z * z, x * x * z)
-    return np.stack([*terms, *cubic, y * y * z, z**3], axis=-1)
+def line_weights(rows: tuple[float, float], count: int, row: ArrayLike) -> Floats:
+    """[..., count]: weights of the coefficients at lines ``row`` of the domain ``rows``, px."""
+    row = np.asarray(row, dtype=np.float64)
+    s = np.clip((row - rows[0]) / (rows[1] - rows[0]), 0.0, 1.0) * (count - 3)
+    first = np.minimum(np.floor(s).astype(np.int64), count - 4)
+    dense = np.zeros((*row.shape, count))
+    for a, weight in enumerate(cubic_weights(s - first)):
+        np.put_along_axis(dense, (first + a)[..., None], weight[..., None], axis=-1)
+    return dense
+
+
+@dataclass(frozen=True, eq=False)
+class LineCorrection:
+    """See MEANING: ``rows`` (row_min, row_max) px; ``coefficients`` float64[2, n] px of C and R.
+
+    Raises ValueError unless they are finite and there are four of each or more.
+    """
+
+    rows: tuple[float, float]
+    coefficients: Floats
+
+    def __post_init__(self) -> None:
+        values = np.array(self.coefficients, dtype=np.float64)
+        if values.ndim != 2 or len(values) != 2 or values.shape[1] < 4:
+            raise ValueError("a correction by line has two splines of four coefficients or more")
+        if not np.isfinite([*self.rows, *values.ravel()]).all() or self.rows[0] >= self.rows[1]:
+            raise ValueError("a correction by line must be finite, and have lines")
+        values.setflags(write=False)
+        object.__setattr__(self, "coefficients", values)
+
+    def at(self, row: ArrayLike) -> Floats:
+        """(C, R) [2, ...] px at lines ``row`` of the smooth sensor."""
+        weights = line_weights(self.rows, self.coefficients.shape[1], np.nan_to_num(row))
+        found = np.moveaxis(weights @ self.coefficients.T, -1, 0)
+        return np.where(np.isfinite(row), found, np.nan)
+
+    def add(self, col: Floats, row: Floats) -> tuple[Floats, Floats]:
+        """Position in the image of a position (col, row) of the smooth sensor, px."""
+        along, across = self.at(row)
+        return col + along, row + across
+
+    def take(self, col: ArrayLike, row: ArrayLike) -> tuple[Floats, Floats]:
+        """The inverse of :meth:`add`; arrays broadcast."""
+        col, row = np.broadcast_arrays(np.asarray(col, float), np.asarray(row, float))
+        smooth = row
+        for _ in range(ROUNDS):
+            last, smooth = smooth, row - self.at(smooth)[1]
+            if not np.nanmax(np.abs(smooth - last), initial=0.0) > 1e-10:
+                break
+        return col - self.at(smooth)[0], smooth
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready, in the words of MEANING."""
+        return {
+            "row_min": self.rows[0],
+            "row_max": self.rows[1],
+            "col": self.coefficients[0].tolist(),
+            "row": self.coefficients[1].tolist(),
+            "meaning": MEANING,
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> LineCorrection:
+        """The inverse of :meth:`to_dict`."""
+        rows = float(values["row_min"]), float(values["row_max"])
+        return cls(rows, np.array([values["col"], values["row"]], dtype=np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,11 +446,7 @@ class SensorModel:
             return lon.ravel(), lat.ravel(), h.ravel()
 
         lon, lat, h = grid(13, 0.0)
-        terms = _terms(
-            (lon - rpc.long_off) / rpc.long_scale,
-            (lat - rpc.lat_off) / rpc.lat_scale,
-            (h - rpc.height_off) / rpc.height_scale,
-        )
+        terms = rpc.terms(lon, lat, h)
         samp_off, line_off = self.affine @ (rpc.samp_off, rpc.line_off, 1.0)
         col, row = self.smooth.project(lon, lat, h)
         fitted = {}
@@ -423,3 +478,13 @@ class SensorModel:
         """The inverse of :meth:`to_dict`."""
         affine = np.array(values["affine"], dtype=np.float64)
         return cls(RPC.from_dict(values["rpc"]), affine, read_correction(values))
+
+
+def read_correction(values: Mapping[str, Any]) -> LineCorrection | None:
+    """The correction of a record of :func:`of_record`; None if it has none."""
+    return LineCorrection.from_dict(values["by_line"]) if "by_line" in values else None
+
+
+def of_record(by_line: LineCorrection | None) -> dict[str, Any]:
+    """What a record has of a correction: nothing without one."""
+    return {} if by_line is None else {"by_line": by_line.to_dict()}

@@ -1,4 +1,4 @@
-"""RPCs as they come: in the TIFF, as _RPC.TXT, .RPB or GaoFen-7's .rpb."""
+"""RPCs as they come: in the image, or in a file beside it, in the forms of :data:`FORMS`."""
 
 from __future__ import annotations
 
@@ -16,39 +16,29 @@ from .rpc import RPC, SCALARS, VECTORS
 
 log = logging.getLogger("stereotruth")
 
-
-_RPB_NAMES = {
-    "lineoffset": "line_off",
-    "sampoffset": "samp_off",
-    "latoffset": "lat_off",
-    "longoffset": "long_off",
-    "heightoffset": "height_off",
-    "linescale": "line_scale",
-    "sampscale": "samp_scale",
-    "latscale": "lat_scale",
-    "longscale": "long_scale",
-    "heightscale": "height_scale",
-    "linenumcoef": "line_num_coeff",
-    "linedencoef": "line_den_coeff",
-    "sampnumcoef": "samp_num_coeff",
-    "sampdencoef": "samp_den_coeff",
-}
-
-
-UNITS = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
 MAX_BYTES = 1_000_000  # of an RPC file; they have some 8000
+UNITS = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
+RPB_NAMES = {name.replace("_off", "offset").replace("_", ""): name for name in SCALARS}
+RPB_NAMES |= {name.removesuffix("f").replace("_", ""): name for name in VECTORS}
+# Possessive (++): a run of letters or blanks is looked at once, however long it is.
+_RPB_ENTRY = re.compile(r"\b(\w++)\s*+=\s*+(?:\(([^()]*+)\)|\"?([^;\n\"(]*+))")
+_TEXT_LINE = re.compile(r"\s*+([A-Za-z_]\w*+)?\s*+([:=]?)(.*)", re.DOTALL)
+
+
+def _number(text: str) -> float:
+    """The number that a value begins with; its unit may follow, another number must not.
+
+    NaN, which no RPC may have, of an empty value.
+    """
+    if not (words := text.split()):
+        return float("nan")
+    if any(word[0] in "+-.0123456789" for word in words[1:]):
+        raise ValueError(f"{text[:40]!r} is more than one number")
+    return decimal_number(words[0])
 
 
 def _numbers(text: str) -> list[float]:
     return [decimal_number(word) for word in text.replace(",", " ").split()]
-
-
-def _number(text: str) -> float:
-    """The number that a value begins with; its unit may follow, another number must not."""
-    number, *rest = text.split()
-    if any(word[0] in "+-.0123456789" for word in rest):
-        raise ValueError(f"{text[:40]!r} is more than one number")
-    return decimal_number(number)
 
 
 def _put(found: dict[str, Any], name: str, value: Any) -> None:
@@ -57,20 +47,16 @@ def _put(found: dict[str, Any], name: str, value: Any) -> None:
     found[name] = value
 
 
-def _parse_rpc_text(text: str) -> dict[str, Any]:
+def _parse_text(text: str) -> dict[str, Any]:
     """Fields of a ``_RPC.TXT``: ``LINE_OFF: 123.0 pixels``, ``LINE_NUM_COEFF_1: 1.0E-3``."""
     found: dict[str, Any] = {}
     for line in text.splitlines():
-        key, sign, value = re.match(
-            r"\s*+([A-Za-z_]\w*+)?\s*+([:=]?)(.*)", line, re.DOTALL
-        ).groups()
-        name, value = (key or "").lower(), value.strip()
-        if sign and name in SCALARS:
-            _put(found, name, _number(value) if value else float("nan"))
-        elif sign and name in VECTORS:
+        key, sign, value = _TEXT_LINE.match(line).groups()
+        name = (key or "").lower()
+        if sign and name in VECTORS:
             _put(found, name, _numbers(value))
-        elif sign and re.fullmatch(r"\w+_coeff_[0-9]+", name):
-            _put(found, name, _number(value) if value else float("nan"))
+        elif sign and (name in SCALARS or re.fullmatch(r"\w+_coeff_[0-9]+", name)):
+            _put(found, name, _number(value))
     for name in VECTORS:
         if name not in found:
             missing = [i for i in range(1, 21) if f"{name}_{i}" not in found]
@@ -80,17 +66,13 @@ def _parse_rpc_text(text: str) -> dict[str, Any]:
     return found
 
 
-# Possessive (++): a run of letters or blanks is looked at once, however long it is.
-_RPB_ENTRY = re.compile(r"\b(\w++)\s*+=\s*+(?:\(([^()]*+)\)|\"?([^;\n\"(]*+))")
-
-
 def _parse_rpb(text: str) -> dict[str, Any]:
     """Fields of an ``.RPB`` (DigitalGlobe, GF-7): ``lineOffset = 1;``, ``lineNumCoef = (…);``."""
     found: dict[str, Any] = {}
     for key, group, value in _RPB_ENTRY.findall(text):
         if key.lower() == "specid" and value.strip().upper() == "RPC00A":
             raise ValueError("SpecId is RPC00A, whose terms have another order than RPC00B's")
-        name = _RPB_NAMES.get(key.lower())
+        name = RPB_NAMES.get(key.lower())
         if name in VECTORS:
             _put(found, name, _numbers(group))
         elif name:
@@ -98,28 +80,40 @@ def _parse_rpb(text: str) -> dict[str, Any]:
     return found
 
 
-def _sidecar(image: Path) -> Path | None:
-    """The RPC file beside an image, in GDAL's order of preference; any case of the letters."""
-    names = {path.name.lower(): path for path in sorted(image.parent.iterdir(), reverse=True)}
-    for ending in (".rpb", "_rpc.txt"):
-        if path := names.get((image.stem + ending).lower()):
-            return path
-    return None
+# What follows an image's stem in the name of its RPC file, in any case of the letters, and how that
+# is read; the first that is there counts, in GDAL's order.
+FORMS = {".rpb": _parse_rpb, "_rpc.txt": _parse_text}
 
 
 def rpc_file(image: str | Path) -> Path:
     """The file that :func:`read_rpc` takes the RPC of an image from: beside it, or itself."""
-    return _sidecar(Path(image)) or Path(image)
+    image = Path(image)
+    names = {path.name.lower(): path for path in sorted(image.parent.iterdir(), reverse=True)}
+    found = (names.get((image.stem + ending).lower()) for ending in FORMS)
+    return next(filter(None, found), image)
 
 
-def _text_of(file: Path) -> str:
-    if file.stat().st_size > MAX_BYTES:
-        raise ValueError(f"{file.stat().st_size} bytes are more than any RPC has")
-    return file.read_text(encoding="utf-8-sig", errors="replace")
+def _fields_of(image: Path, source: Path) -> dict[str, Any]:
+    """The fields of an RPC file, or of the metadata of an image that is its own source."""
+    if source == image:
+        with open_raster(image) as dataset:
+            tags = dataset.tags(ns="RPC")
+        if not tags:
+            raise InputError(
+                "image has no RPC metadata",
+                file=image,
+                remedy=f"put {image.stem}_RPC.TXT or {image.stem}.rpb beside it, or an RPC "
+                "tag into the TIFF",
+            )
+        return _parse_text("\n".join(f"{key}: {value}" for key, value in tags.items()))
+    if (size := source.stat().st_size) > MAX_BYTES:
+        raise ValueError(f"{size} bytes are more than any RPC has")
+    parse = next(FORMS[ending] for ending in FORMS if source.name.lower().endswith(ending))
+    return parse(source.read_text(encoding="utf-8-sig", errors="replace"))
 
 
 def read_rpc(image: str | Path) -> RPC:
-    """The RPC of an image file: from ``.RPB``/``.rpb`` or ``_RPC.TXT`` beside it, or its metadata.
+    """The RPC of an image file: from a file of :data:`FORMS` beside it, or its metadata.
 
     Metadata are those that GDAL reads, above all the TIFF tag RPCCoefficientTag (50844). A file
     beside the image goes before the tag, as in GDAL, so that a better RPC can be put there.
@@ -131,20 +125,7 @@ def read_rpc(image: str | Path) -> RPC:
         raise InputError("no such image", file=image, remedy="correct the path in the scene sheet")
     source = rpc_file(image)
     try:
-        if source != image:
-            parse = _parse_rpb if source.suffix.lower() == ".rpb" else _parse_rpc_text
-            rpc = RPC.from_dict(parse(_text_of(source)))
-        else:
-            with open_raster(image) as dataset:
-                tags = {key.lower(): value for key, value in dataset.tags(ns="RPC").items()}
-            if not tags:
-                raise InputError(
-                    "image has no RPC metadata",
-                    file=image,
-                    remedy=f"put {image.stem}_RPC.TXT or {image.stem}.rpb beside it, or an RPC "
-                    "tag into the TIFF",
-                )
-            rpc = RPC.from_dict(_parse_rpc_text("\n".join(f"{k}: {v}" for k, v in tags.items())))
+        rpc = RPC.from_dict(_fields_of(image, source))
     except InputError:
         raise
     except RasterioError as error:

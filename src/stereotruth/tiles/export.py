@@ -12,10 +12,7 @@ Rules for a pair, at its window of the scene's grid:
   complete images go under ``unlabelled/``.
 
 Each labelled pair is held against its images as it is written: SIFT matches, image warping, and the
-gates of :mod:`.quality_limits`, which flag tiles and scenes in the manifest and the summary.
-
-The phase of each scene's tile grid (origin of its first window, in steps of about an eighth of a
-tile) is that which gives most labelled pairs, then most pairs, then most labelled pixels.
+gates of :mod:`.label_doubts`, which flag tiles and scenes in the manifest and the summary.
 """
 
 from __future__ import annotations
@@ -31,90 +28,46 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.configuration import Export, Limits
+from ..core.config.configuration import Export
 from ..core.errors import InputError
 from ..core.job import progress
 from ..core.products.files import atomic_file, atomic_folder, growing_table, write_table
 from ..core.products.provenance import describe, file_sha256, own_digest, source_digest
-from .footprints import FOOTPRINTS, feature, write_footprints
-from .ground_looks import write_ground_looks
-from .label_doubts import Doubt, ToldDoubt, doubts, surface_figures
-from .layer_kinds import column
+from .label_doubts import Doubt, doubts, flag, missed, surface_figures
+from .manifest import FOOTPRINTS, NONE, STATUS_COLOURS_FILE, column
 from .orientation import save
-from .quality_limits import flag, missed
 from .quick_looks import (
-    STATUS_COLOURS_FILE,
     draw_contact_sheet,
     draw_coverage,
+    feature,
+    write_footprints,
+    write_ground_looks,
     write_status_colours,
 )
-from .scene_stores import SceneFiles, SceneStores, open_stores
+from .scene_stores import (
+    SceneFiles,
+    SceneStores,
+    Window,
+    cell_step,
+    choose_windows,
+    open_stores,
+    scan_scene,
+)
 from .sift_matches import MATCH_COLUMNS, match_rows
-from .split_names import NONE
 from .splits import Place, scaled_counts, split_tiles
-from .summary import in_counts, summarise
-from .tile_checks import CHECK_COLUMNS, SceneChecks, TileChecks, sigma_by_surface
-from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
-from .windows import Window, cell_step, choose_windows, scan_scene
+from .tile_checks import (
+    CHECK_COLUMNS,
+    SceneChecks,
+    TileChecks,
+    in_counts,
+    sigma_by_surface,
+    summarise,
+)
+from .tile_files import FILES, RIGHT_FILES, City, Cut, write_tile
 
 log = logging.getLogger("stereotruth")
 
 SPARSE = 1.0  # LiDAR points in a pixel; with fewer, most windows have too few labels
-
-
-def _refuse_empty(
-    city: str,
-    outcomes: Mapping[str, Mapping[str, int]],
-    size: int,
-    min_labelled: float,
-    sources: Sequence[SceneStores],
-) -> None:
-    lines = [
-        f"scene {scene}: " + ", ".join(f"{count} {what}" for what, count in outcome.items())
-        for scene, outcome in outcomes.items()
-    ]
-    sparse = ", ".join(
-        f"{source.scene} {source.points_per_px:.2g}"
-        for source in sources
-        if source.points_per_px is not None and source.points_per_px < SPARSE
-    )
-    if sparse:
-        sparse = (
-            f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
-            "project.recipe: surface, the default, labels pixels between them"
-        )
-    told = "; ".join(
-        f"the alignment of scene {source.scene} is in doubt: {doubt}"
-        for source in sources
-        for doubt in source.doubts
-    )
-    remedy = (
-        f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now {min_labelled:g}), "
-        f"or LiDAR that covers the overlap of the two images{sparse}"
-    )
-    if told:
-        told = f". Labels are missing where LiDAR and images disagree: {told}"
-        remedy = f"first what the alignment's doubts say; else {remedy}"
-    raise InputError(
-        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){told}",
-        remedy=remedy,
-    )
-
-
-@dataclass(frozen=True)
-class City:
-    """A row of the cities sheet: a name, the prefix of its tiles, and tiles of table 3 by split."""
-
-    city: str
-    prefix: str
-    training: int
-    validation: int
-    testing: int
-
-    @property
-    def split_counts(self) -> dict[str, int]:
-        """Tiles by split, which are scaled to the tiles there are."""
-        return {"train": self.training, "val": self.validation, "test": self.testing}
 
 
 @dataclass(frozen=True)
@@ -131,8 +84,9 @@ class Extras:
     ground_looks: str | Path | None = None
 
     @contextmanager
-    def being_written(self) -> Iterator[_ExtrasBeingWritten]:
-        """Places that become the files when the block ends well, all at the end.
+    def being_written(self) -> Iterator[tuple[Extras, Any]]:
+        """Places that become the files when the block ends well, all at the end; and the writer of
+        the table of matches.
 
         A job that outlives its run cannot be found halfway.
         """
@@ -147,32 +101,7 @@ class Extras:
             looks = None
             if self.ground_looks is not None:
                 looks = stack.enter_context(atomic_folder(self.ground_looks))
-            yield _ExtrasBeingWritten(coverage, contact_sheet, table, looks)
-
-
-@dataclass(frozen=True)
-class _ExtrasBeingWritten:
-    """Where the extras are written until they are whole."""
-
-    coverage: Path | None
-    contact_sheet: Path | None
-    table: Any
-    looks: Path | None
-
-    def add_matches(self, row: Mapping[str, Any], checks: TileChecks) -> None:
-        """Add a tile's matches to the table."""
-        if self.table is not None:
-            head = {key: row[key] for key in ("city", "scene", "tile", "class")}
-            self.table.writerows(match_rows(head, checks.matches))
-
-    def draw(
-        self, city: str, rows: Sequence[dict[str, Any]], windows: _Windows, tiles: Path, nodata: Any
-    ) -> None:
-        """Draw both figures, one after the other: Matplotlib is not made for threads."""
-        if self.coverage is not None:
-            draw_coverage(self.coverage, city, rows, windows.pictures)
-        if self.contact_sheet is not None:
-            draw_contact_sheet(self.contact_sheet, city, rows, tiles, nodata)
+            yield Extras(coverage, contact_sheet, self.matches, looks), table
 
 
 @dataclass(frozen=True)
@@ -231,41 +160,40 @@ def export_city(
     """Cut a city's scenes into tiles: the whole folder ``tiles/<City>``, or nothing.
 
     ``scenes``: per scene its id, disparity.zarr, left.zarr, right.zarr and optionally
-    alignment.json (for the record) and the store of the right view's labels. ``extras``: what is
+    alignment.json (for the record), the store of the right view's labels, the days of its images
+    and what the alignment says. ``extras``: what is
     made besides. ``work``: folder in which finished tiles wait for a later call that would make the
     same, by default a hidden one beside ``out_dir``. Returns a summary, see
-    :func:`.summary.summary_lines`.
+    :func:`.tile_checks.summary_lines`.
 
     Raises InputError if there is no labelled pair, if the settings cannot work, or if
     ``strict`` and the splits' counts cannot be met or a limit of ``quality`` is exceeded.
     """
     out, extras = Path(out_dir), extras or Extras()
-    _refuse_nodata(settings)
+    dtype, nodata = settings.disparity_dtype, settings.nodata
+    if float(np.dtype(dtype).type(nodata)) != float(nodata):
+        raise InputError(
+            f"nodata {nodata:g} cannot be stored in {dtype}",
+            remedy="set tiles.nodata to -999, or tiles.disparity_dtype to float32",
+        )
     windows = _Windows.of(scenes, settings, workers)
     if not any(window.labelled for _, window in windows.chosen):
-        sources = windows.sources
-        _refuse_empty(city.city, windows.outcomes, settings.size, settings.min_labelled, sources)
+        _refuse_empty(city.city, windows, settings)
     parameters = _parameters(settings, city)
     inputs = {name: value for source in windows.sources for name, value in source.inputs.items()}
     flags = {name: flag for source in windows.sources for name, flag in source.flags.items()}
     cut = Cut(
-        city=city.city,
-        prefix=city.prefix,
-        size=settings.size,
-        dtype=settings.disparity_dtype,
-        nodata=settings.nodata,
-        building_share=settings.building_share,
-        limits=settings.quality,
+        city=city,
+        settings=settings,
         code=code or source_digest("stereotruth.tiles.export"),
         flags=dict(sorted(flags.items())),
-        layers=tuple(settings.layers),
         work=out.with_name(f".{out.name}.work") if work is None else Path(work),
         provenance=describe(inputs, parameters, code),
     )
     with extras.being_written() as beside, atomic_folder(out) as scratch:
-        for kind in windows.kinds(cut.layers):
+        for kind in windows.kinds(settings.layers):
             (scratch / kind).mkdir(parents=True)
-        summary, rows = _write_tiles(scratch, windows, cut, beside, parameters, settings, workers)
+        summary, rows = _write_tiles(scratch, windows, cut, beside, parameters, workers)
         record = summary | {
             "manifest_sha256": file_sha256(scratch / "manifest.csv"),
             "footprints_sha256": file_sha256(scratch / FOOTPRINTS),
@@ -276,13 +204,38 @@ def export_city(
     return summary
 
 
-def _refuse_nodata(settings: Export) -> None:
-    dtype, nodata = settings.disparity_dtype, settings.nodata
-    if float(np.dtype(dtype).type(nodata)) != float(nodata):
-        raise InputError(
-            f"nodata {nodata:g} cannot be stored in {dtype}",
-            remedy="set tiles.nodata to -999, or tiles.disparity_dtype to float32",
+def _refuse_empty(city: str, windows: _Windows, settings: Export) -> None:
+    size, sources = settings.size, windows.sources
+    lines = [
+        f"scene {scene}: " + ", ".join(f"{count} {what}" for what, count in outcome.items())
+        for scene, outcome in windows.outcomes.items()
+    ]
+    sparse = ", ".join(
+        f"{source.scene} {source.points_per_px:.2g}"
+        for source in sources
+        if source.points_per_px is not None and source.points_per_px < SPARSE
+    )
+    if sparse:
+        sparse = (
+            f"; LiDAR points are sparser than pixels (a pixel has, on the average: {sparse}): "
+            "project.recipe: surface, the default, labels pixels between them"
         )
+    told = "; ".join(
+        f"the alignment of scene {source.scene} is in doubt: {doubt}"
+        for source in sources
+        for doubt in source.doubts
+    )
+    remedy = (
+        f"a smaller tiles.size (now {size}), a smaller tiles.min_labelled (now "
+        f"{settings.min_labelled:g}), or LiDAR that covers the overlap of the two images{sparse}"
+    )
+    if told:
+        told = f". Labels are missing where LiDAR and images disagree: {told}"
+        remedy = f"first what the alignment's doubts say; else {remedy}"
+    raise InputError(
+        f"{city}: not one labelled tile pair of {size} px ({'; '.join(lines)}){told}",
+        remedy=remedy,
+    )
 
 
 def _parameters(settings: Export, city: City) -> dict[str, Any]:
@@ -307,38 +260,46 @@ def _write_tiles(
     scratch: Path,
     windows: _Windows,
     cut: Cut,
-    beside: _ExtrasBeingWritten,
+    beside: tuple[Extras, Any],
     parameters: Mapping[str, Any],
-    settings: Export,
     workers: int,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Write tiles, manifest, footprints and extras; the summary, and the manifest's rows."""
+    (extras, table), settings = beside, cut.settings
 
     def write(k: int) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
         return write_tile(scratch, *windows.chosen[k], k, cut)
 
-    city, count = cut.city, len(windows.chosen)
+    def draw(rows: Sequence[dict[str, Any]]) -> None:
+        """One figure after the other: Matplotlib is not made for threads."""
+        if extras.coverage is not None:
+            draw_coverage(extras.coverage, city, rows, windows.pictures)
+        if extras.contact_sheet is not None:
+            draw_contact_sheet(extras.contact_sheet, city, rows, scratch, settings.nodata)
+
+    city, count = cut.city.city, len(windows.chosen)
     written, scene_checks = [], {s.scene: SceneChecks(s.gcp_rms) for s in windows.sources}
     with ThreadPoolExecutor(workers) as pool:
         tiles = pool.map(write, range(count))
         drawn = []  # while the last tiles are written
-        if beside.looks is not None:
-            drawn = [pool.submit(write_ground_looks, beside.looks, s) for s in windows.sources]
+        if (looks := extras.ground_looks) is not None:
+            drawn = [pool.submit(write_ground_looks, looks, s) for s in windows.sources]
         for row, ring, checks in progress(tiles, count, f"{city}: tiles"):
             written.append((row, ring))
             if checks is not None:
                 scene_checks[row["scene"]].add(checks, row["row0"], row["col0"])
-                beside.add_matches(row, checks)
+                if table is not None:
+                    head = {key: row[key] for key in ("city", "scene", "tile", "class")}
+                    table.writerows(match_rows(head, checks.matches))
         rows = [row for row, _ in written]
-        splits = _split(written, parameters["split_counts"], settings.seed, settings.strict, city)
-        drawn.append(pool.submit(beside.draw, city, rows, windows, scratch, settings.nodata))
+        splits = _split(written, cut.city, settings)
+        drawn.append(pool.submit(draw, rows))
         told = {source.scene: source.told for source in windows.sources}
-        gates = _gates(city, rows, scene_checks, told, settings.quality, settings.strict)
+        gates = _gates(city, rows, scene_checks, told, settings)
         for source in windows.sources:
             gates["scenes"][source.scene]["lidar_points_per_m2"] = source.points_per_m2
             gates["scenes"][source.scene]["lidar"] = source.lidar
-        half = settings.disparity_dtype == "float16"
-        summary = summarise(city, rows, splits, windows.phases, windows.outcomes, parameters, half)
+        summary = summarise(city, rows, splits, windows.phases, windows.outcomes, parameters)
         summary["quality"] = gates
         stated = np.sum([checks.stated for checks in scene_checks.values()], axis=0)
         summary["label_uncertainty"] = sigma_by_surface(stated)
@@ -356,7 +317,7 @@ def _forget_others(cut: Cut, rows: Sequence[Mapping[str, Any]]) -> None:
     kept = {
         cut.work / row[kind]
         for row in rows
-        for kind in (*FILES, *RIGHT_FILES, *map(column, cut.layers))
+        for kind in (*FILES, *RIGHT_FILES, *map(column, cut.settings.layers))
         if row.get(kind)
     }
     for file in cut.work.rglob("*.tiff"):
@@ -365,28 +326,25 @@ def _forget_others(cut: Cut, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _split(
-    written: Sequence[tuple[dict[str, Any], NDArray[np.float64]]],
-    weights: Mapping[str, int],
-    seed: int,
-    strict: bool,
-    city: str,
+    written: Sequence[tuple[dict[str, Any], NDArray[np.float64]]], city: City, settings: Export
 ) -> dict[str, Any]:
     """Set the split of every labelled row; wanted and realised counts."""
+    weights = city.split_counts
     labelled = [(row, ring) for row, ring in written if row["complete"] == "yes"]
     places = [
         Place(row["scene"], row["row0"], row["col0"], row["size"], ring) for row, ring in labelled
     ]
-    found = split_tiles(places, weights, seed)
+    found = split_tiles(places, weights, settings.seed)
     for (row, _), split in zip(labelled, found):
         row["split"] = split
     wanted = scaled_counts(len(labelled), weights)
     realised = {name: found.count(name) for name in (*wanted, NONE)}
     if any(realised[name] != count for name, count in wanted.items()):
         problem = (
-            f"{city}: splits of {in_counts(realised)} tiles instead of {in_counts(wanted)}, since "
-            "tiles that share ground must not be in two splits"
+            f"{city.city}: splits of {in_counts(realised)} tiles instead of {in_counts(wanted)}, "
+            "since tiles that share ground must not be in two splits"
         )
-        if strict:
+        if settings.strict:
             raise InputError(problem, remedy="a tiles.stride of tiles.size, or strict: false")
         log.warning("%s", problem)
     return {"wanted": wanted, "realised": realised}
@@ -396,17 +354,16 @@ def _gates(
     city: str,
     rows: Sequence[dict[str, Any]],
     scenes: Mapping[str, SceneChecks],
-    told: Mapping[str, Sequence[ToldDoubt]],
-    limits: Limits,
-    strict: bool,
+    told: Mapping[str, Sequence[Doubt]],
+    settings: Export,
 ) -> dict[str, Any]:
     """Figures, missed gates and doubts of scenes, flagged tiles; sets the doubt of every tile.
 
     ``told``: by scene, what earlier stages have said of it. Logs each miss and what the images
     doubt, or ends a strict run.
     """
-    found, problems = {}, []
-    in_doubt: dict[str, list[Doubt | ToldDoubt]] = {}
+    limits, found, problems = settings.quality, {}, []
+    in_doubt: dict[str, list[Doubt]] = {}
     for scene, checks in scenes.items():
         figures = checks.figures()
         misses = missed(figures, limits)
@@ -423,7 +380,7 @@ def _gates(
             f"tile {row['tile']} of scene {row['scene']}: {miss}"
             for miss in missed(figures, limits)
         ]
-    if problems and strict:
+    if problems and settings.strict:
         more = f"; and {len(problems) - 5} more" if len(problems) > 5 else ""
         raise InputError(
             f"{city}: beyond the limits of quality: {'; '.join(problems[:5])}{more}",

@@ -1,30 +1,29 @@
-"""What the images say of a scene's labels, by surface, and whether that contradicts the labels.
+"""What images say of labels: doubts about a scene by surface, and limits of tiles and scenes.
 
 Of each surface the location of 'SIFT disparity less label' is found robustly (see
-:func:`location`), with a standard error from the scatter between cells of ``CELL_PX``: matches of
-one cell share their relief, their texture and their points. SIFT itself is off by
-``SIFT_SIGMA_PX``. What the alignment states of the labels is the ``STATED`` quantile of their
-uncertainty there: the noise of the points hardly adds to it.
+:func:`location`), with a standard error from the scatter between cells of ``CELL_PX``. A
+disagreement that chance explains too seldom, by that error, what SIFT itself is off and what the
+labels state, is a doubt. One that the labels' uncertainty does explain, but is significant without
+it and larger than ``REMARK_PX``, is a remark (docs/explanation/uncertainty.md). Crowns are told,
+and raise neither. Rows are judged in the same way by the y-parallax, which should be zero.
 
-A disagreement that chance explains too seldom, by all three and Student's t, is a doubt: the labels
-are farther off than they state. One that the alignment's uncertainty does explain, but is
-significant without it and larger than ``REMARK_PX``, is a remark: the labels are honest and could
-be better. Crowns are told, and raise neither. Rows are judged in the same way by the y-parallax,
-which should be zero.
+Limits hold figures that need no truth: residuals of the control points, SIFT matches and image
+warping (section IV of the paper). A tile or scene beyond one is flagged, not dropped.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
+from ..core.config.configuration import Limits
 from ..core.numerics.statistics import TO_SIGMA, biweight
 from .label_surfaces import LabelSurface
 from .sift_matches import TileMatches
@@ -40,6 +39,16 @@ REACH = 3.0  # scales from the location at which a match no longer counts
 STEPS = 100  # of the iteration, at most
 PARALLAX = "y-parallax"
 ALIGNMENT, LIDAR, STRIPS = ABOUT = ("alignment", "LiDAR", "strips")  # what earlier stages tell of
+FIGURES = {  # the figure that a limit is for; of signed figures, the size counts
+    "max_gcp_rms_px": "gcp_rms_px",
+    "max_y_parallax_px": "y_parallax_median_px",
+    "max_sift_error_px": "sift_median_error_px",
+    "max_sift_mean_absolute_error_px": "sift_mean_absolute_error_px",
+    "min_sift_matches": "sift_matches",
+    "min_warp_correlation": "warp_correlation",
+    "min_agreement": "agreement",
+}
+OF_ERRORS = ("max_sift_error_px", "max_sift_mean_absolute_error_px")
 JUDGED = (LabelSurface.OPEN_GROUND.words, LabelSurface.ROOFS.words, PARALLAX)
 
 
@@ -83,38 +92,21 @@ class Bias:
             "labels_sigma_px": round(self.stated, 4),
         }
 
+    def sentence(self, explained: bool) -> str:
+        """The disagreement in words; ``explained``: what the labels state covers it."""
+        if self.surface == PARALLAX:
+            what = f"rows of left and right differ by {self.value:+.2f} ± {self.sigma:.2f} px"
+        else:
+            value = f"{self.value:+.2f} ± {self.sigma:.2f} px"
+            what = f"images say {value} of the labels of {self.surface}"
+        word = "within" if explained else "more than"
+        return f"{what}, {word} the {self.stated:.2f} px that the alignment states"
+
 
 @dataclass(frozen=True)
 class Doubt:
-    """A disagreement of images and labels; ``explained``: the labels' own uncertainty covers it."""
-
-    bias: Bias
-    explained: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
-        return {
-            "of": self.bias.surface,
-            "text": str(self),
-            "explained_by_alignment": self.explained,
-        }
-
-    def __str__(self) -> str:
-        b = self.bias
-        if b.surface == PARALLAX:
-            what = f"rows of left and right differ by {b.value:+.2f} ± {b.sigma:.2f} px"
-        else:
-            what = f"images say {b.value:+.2f} ± {b.sigma:.2f} px of the labels of {b.surface}"
-        word = "within" if self.explained else "more than"
-        return f"{what}, {word} the {b.stated:.2f} px that the alignment states"
-
-
-@dataclass(frozen=True)
-class ToldDoubt:
-    """What an earlier stage has said of a scene, by its ``sentence``, ``about`` one of ABOUT.
-
-    ``explained``: labels state it in their uncertainty.
-    """
+    """What is doubted of a scene: by its images, ``about`` a surface, or told by earlier stages,
+    ``about`` one of ABOUT; ``explained``: labels state it in their uncertainty."""
 
     about: str
     sentence: str
@@ -231,13 +223,50 @@ def doubts(biases: Iterable[Bias], probability: float | None) -> list[Doubt]:
     judged = [bias for bias in biases if bias.surface in JUDGED]
     found = []
     for bias in judged:
-        if bias.chance(bias.stated) * len(judged) < probability:
-            found.append(Doubt(bias, explained=False))
-        elif bias.chance(0.0) * len(judged) < probability and abs(bias.value) > REMARK_PX:
-            found.append(Doubt(bias, explained=True))
+        unlikely = bias.chance(bias.stated) * len(judged) < probability
+        alone = bias.chance(0.0) * len(judged) < probability and abs(bias.value) > REMARK_PX
+        if unlikely or alone:
+            explained = not unlikely
+            found.append(Doubt(bias.surface, bias.sentence(explained), explained))
     return found
 
 
 def surface_figures(biases: Iterable[Bias]) -> dict[str, Any]:
     """By surface, JSON-ready."""
     return {bias.surface.replace(" ", "_"): bias.to_dict() for bias in biases}
+
+
+class Miss(NamedTuple):
+    """A gate that was missed: its name in the configuration, the value found, the limit."""
+
+    gate: str
+    value: float
+    limit: float
+
+    def __str__(self) -> str:
+        word = "below" if self.gate.startswith("min_") else "above"
+        return f"{FIGURES[self.gate]} {self.value:.3g} is {word} {self.gate} {self.limit:g}"
+
+
+def missed(figures: Mapping[str, float | int | None], limits: Limits) -> list[Miss]:
+    """Gates that the figures miss, in the order of the limits.
+
+    A figure that is absent, None or NaN misses nothing. With fewer matches than
+    ``min_sift_matches``, that gate alone speaks for their errors: a few say nothing.
+    """
+    found = []
+    count = figures.get("sift_matches")
+    few = limits.min_sift_matches is not None and (count or 0) < limits.min_sift_matches
+    for gate, name in FIGURES.items():
+        limit, value = getattr(limits, gate), figures.get(name)
+        if limit is None or value is None or math.isnan(value) or (few and gate in OF_ERRORS):
+            continue
+        low = gate.startswith("min_")
+        if value < limit if low else abs(value) > limit:
+            found.append(Miss(gate, value, limit))
+    return found
+
+
+def flag(misses: Sequence[Miss]) -> str:
+    """Cell of the manifest: ``ok``, or the names of the missed gates with ``;`` between."""
+    return ";".join(miss.gate for miss in misses) or "ok"

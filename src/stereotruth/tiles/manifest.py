@@ -1,7 +1,22 @@
 """The manifest of a folder of tiles or of a dataset: a line per pair, and its one reader.
 
 What a line states becomes names of files. It may come from somebody else, so that every line is
-held to plain names, and to paths below the manifest's folder (:mod:`..products.names`).
+held to plain names, and to paths below the manifest's folder (:mod:`..core.products.names`).
+
+Beside its labels, a tile has the layers that a user asks for, on the grid of the left image:
+
+============  =======  =========================================================================
+layer         type     what it holds
+============  =======  =========================================================================
+height        float32  height above the WGS 84 ellipsoid of what the label shows, m
+class         uint8    LAS class (ASPRS) of the highest point that the label rests on; 0: none
+agl           float32  its height above the ground, m
+uncertainty   float32  standard uncertainty of the disparity, px
+lidar_date    uint16   when the LiDAR measured what the label shows, days since 1970-01-01; 0: not
+                       known
+============  =======  =========================================================================
+
+Where a pixel has no label they hold nodata: NODATA, or 0 of whole numbers.
 """
 
 from __future__ import annotations
@@ -11,15 +26,52 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from ..core.errors import InputError
 from ..core.products.files import path_below, plain_name, read_table, shown
-from .split_names import NONE, SPLITS
+from ..core.status import Status
 
+SPLITS = ("train", "val", "test")
+NONE = "none"  # of pairs without labels, and of those that share ground with two splits
+TRUTH, NO_TRUTH = "with ground truth", "without ground truth"  # folders of the published layout
+FOOTPRINTS, STYLE = "footprints.geojson", "footprints.qml"  # beside the manifest
+STATUS_COLOURS_FILE = "status_colours.txt"
+NODATA = -9999.0  # of layers of real numbers
 NAMES = ("tile", "city", "scene", "split")  # columns that name something
 PATHS = ("left", "right", "disp")  # columns of files, with all that have a checksum
 WHOLE = ("row0", "col0", "size", "right_offset_px")
 SUM = "_sha256"  # ends the name of a checksum's column, which begins with that of the file
+MAKE_AGAIN = "get or make the folder again"
+
+
+class LayerKind(NamedTuple):
+    """``dtype`` of the file, its nodata, and what it says of itself."""
+
+    dtype: str
+    nodata: float
+    description: str
+
+
+KINDS = {
+    "height": LayerKind("float32", NODATA, "height above the WGS 84 ellipsoid in m"),
+    "class": LayerKind("uint8", 0, "LAS class (ASPRS)"),
+    "agl": LayerKind("float32", NODATA, "height above the ground in m"),
+    "uncertainty": LayerKind("float32", NODATA, "standard uncertainty of the disparity in px"),
+    "lidar_date": LayerKind("uint16", 0, "days since 1970-01-01 of the LiDAR"),
+}
+
+
+def column(name: str) -> str:
+    """The manifest's column of a layer's file; ``class`` alone is that of the tile."""
+    return f"layer_{name}"
+
+
+def tile_flags(flags: Mapping[int, str]) -> dict[int, str]:
+    """Names of the status values of tiles, from those of their store."""
+    more = Status.LABELLED_CROWN.label in flags.values()
+    added = {int(Status.TOO_UNCERTAIN): Status.TOO_UNCERTAIN.label} if more else {}
+    return dict(flags) | added
 
 
 @dataclass(frozen=True)
@@ -74,19 +126,14 @@ def manifest_rows(file: Path) -> Iterator[dict[str, str]]:
             _check(row, f"line {number}", file)
             yield row
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(
-            f"no table of text ({error})", file=file, remedy="get or make the folder again"
-        ) from None
+        raise InputError(f"no table of text ({error})", file=file, remedy=MAKE_AGAIN) from None
 
 
 def _check(row: Mapping[str, str], where: str, file: Path) -> None:
     """Raise InputError if a line cannot be used."""
     if None in row or None in row.values():
-        raise InputError(
-            f"{where} has not as many cells as columns",
-            file=file,
-            remedy="get or make the folder again",
-        )
+        problem = f"{where} has not as many cells as columns"
+        raise InputError(problem, file=file, remedy=MAKE_AGAIN)
     for column in NAMES:
         if column in row and (row[column] or column == "tile"):
             plain_name(row[column], f"{where}: {column}", file)
@@ -97,11 +144,8 @@ def _check(row: Mapping[str, str], where: str, file: Path) -> None:
     if row.get("split", NONE) not in (*SPLITS, NONE, ""):
         wrong.append("split")
     if wrong:
-        raise InputError(
-            f"{where}: {wrong[0]} is {shown(row[wrong[0]])}",
-            file=file,
-            remedy="get or make the folder again",
-        )
+        problem = f"{where}: {wrong[0]} is {shown(row[wrong[0]])}"
+        raise InputError(problem, file=file, remedy=MAKE_AGAIN)
 
 
 def read_manifest(folder: str | Path) -> list[dict[str, str]]:

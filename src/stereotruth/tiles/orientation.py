@@ -6,22 +6,25 @@ coordinates, with their measured errors, beside the RPCs and the epipolar model 
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from statistics import fmean
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..core.numerics.geometry import for_readers
-from .polynomials import evaluate, fit
-
-if TYPE_CHECKING:
-    from ..epipolar.model import EpipolarModel
+from ..core.numerics.geometry import for_readers, metres_per_degree
 
 Floats = NDArray[np.float64]
+Model = (
+    Any  # stereotruth.epipolar.model.EpipolarModel, which whoever reads such a file need not have
+)
 
 
 RING_SIDE = 8  # points of the footprint per side of the tile
@@ -55,6 +58,79 @@ OF_LINES = (
 )
 
 
+def _monomials(t: Floats, exponents: NDArray[np.intp]) -> Floats:
+    """Terms [n, m] of normalised inputs [k, n] for exponents [m, k]."""
+    return np.prod(t.T[:, None, :] ** exponents[None], axis=2)
+
+
+def evaluate(polynomial: Mapping[str, Any], *inputs: ArrayLike) -> dict[str, Floats]:
+    """Outputs by name of a polynomial of an orientation file; inputs in its order."""
+    arrays = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in inputs))
+    t = np.stack([a.ravel() for a in arrays])
+    offset, scale = (np.array(polynomial[f"input_{k}"])[:, None] for k in ("offset", "scale"))
+    terms = _monomials((t - offset) / scale, np.array(polynomial["exponents"]))
+    return {
+        name: (
+            polynomial["output_offset"][name]
+            + polynomial["output_scale"][name] * (terms @ np.array(coefficients))
+        ).reshape(arrays[0].shape)
+        for name, coefficients in polynomial["coefficients"].items()
+    }
+
+
+def _middle(values: Floats) -> tuple[float, float]:
+    low, high = float(values.min()), float(values.max())
+    return (low + high) / 2.0, max((high - low) / 2.0, 1e-12)
+
+
+def fit(
+    inputs: Mapping[str, Floats],
+    outputs: Mapping[str, Floats],
+    check_inputs: Sequence[Floats],
+    check_outputs: Sequence[Floats],
+    tolerance: Mapping[str, float],
+) -> dict[str, Any]:
+    """Least-squares polynomial of degree 3, or up to 5 where 3 misses the tolerance.
+
+    All arrays are flat; the check points take no part in the fit and give ``max_error``.
+    """
+    names = list(outputs)
+    offset, scale = zip(*(_middle(values) for values in inputs.values()))
+    t = (np.stack(list(inputs.values())) - np.array(offset)[:, None]) / np.array(scale)[:, None]
+    for degree in (3, 4, 5):
+        every = itertools.product(range(degree + 1), repeat=len(inputs))
+        low = [e for e in every if sum(e) <= degree]
+        exponents = np.array(sorted(low, key=lambda e: (sum(e), e)))
+        terms = _monomials(t, exponents)
+        record: dict[str, Any] = {
+            "inputs": list(inputs),
+            "outputs": names,
+            "degree": degree,
+            "input_offset": list(offset),
+            "input_scale": list(scale),
+            "output_offset": {},
+            "output_scale": {},
+            "exponents": exponents.tolist(),
+            "coefficients": {},
+        }
+        for name, values in outputs.items():
+            middle, half = _middle(values)
+            solution = np.linalg.lstsq(terms, (values - middle) / half, rcond=None)[0]
+            record["output_offset"][name] = middle
+            record["output_scale"][name] = half
+            # 1e-11 of a tile: far below any error here, and the same text on every machine.
+            record["coefficients"][name] = [round(float(c), 11) + 0.0 for c in solution]
+        got = evaluate(record, *check_inputs)
+        error = {n: float(np.abs(got[n] - v).max()) for n, v in zip(names, check_outputs)}
+        # Below a thousandth of the tolerance it is the rounding of this machine.
+        record["max_error"] = {
+            n: float(f"{max(e, tolerance[n] / 1000):.2g}") for n, e in error.items()
+        }
+        if all(error[n] <= tolerance[n] for n in names):
+            break
+    return record
+
+
 def _nodes(low: float, high: float, count: int) -> Floats:
     """Chebyshev points of [low, high], which keep a least-squares fit even up to the border."""
     angle = np.pi * (np.arange(count) + 0.5) / count
@@ -85,7 +161,7 @@ def view_polynomials(
 
 
 def ground_polynomial(
-    model: EpipolarModel,
+    model: Model,
     row0: int,
     col0: int,
     size: int,
@@ -118,7 +194,7 @@ def ground_polynomial(
 
 
 def footprint(
-    model: EpipolarModel, row0: int, col0: int, size: int, height: NDArray[np.floating]
+    model: Model, row0: int, col0: int, size: int, height: NDArray[np.floating]
 ) -> tuple[Floats, Floats]:
     """Ring of a left tile's border on the ground: lon, lat [4 k, 2] in degrees, heights [4 k] in m.
 
@@ -152,7 +228,7 @@ def sensor_record(sensor: Any) -> dict[str, Any]:
 
 
 def orientation(
-    model: EpipolarModel,
+    model: Model,
     sensors: Mapping[str, Mapping[str, Any]],
     *,
     row0: int,
@@ -204,7 +280,7 @@ def orientation(
 
 
 def _recipe(
-    model: EpipolarModel,
+    model: Model,
     views: Mapping[str, Any],
     ground: Mapping[str, Any],
     offset: int,
@@ -251,3 +327,40 @@ def save(path: Path, record: Mapping[str, Any]) -> None:
     text = json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False)
     flat = re.sub(r"\[\s+([^\[\]{}\"]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text)
     path.write_text(flat + "\n", encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class PixelSize:
+    """Metres of one px: ``ground_m`` along a row, ``height_m`` for one px of disparity."""
+
+    ground_m: float
+    height_m: float
+
+    @property
+    def base_to_height(self) -> float:
+        """Parallax on the ground for one metre of height."""
+        return self.ground_m / self.height_m
+
+    @classmethod
+    def of(cls, orientation: Mapping[str, Any]) -> PixelSize:
+        """In the middle of a tile and of its disparities, by its orientation record."""
+        ground = orientation["ground"]
+        middle = orientation["window"]["size"] / 2
+        low, high = ground["disparity_range_px"]
+        d = (low + high) / 2
+        below, above = (evaluate(ground, middle, middle, d + k)["height"] for k in (-0.5, 0.5))
+        a, b = (evaluate(ground, middle + k, middle, d) for k in (-0.5, 0.5))
+        degrees = b["lon"] - a["lon"], b["lat"] - a["lat"]
+        return cls(math.hypot(*(degrees * metres_per_degree(a["lat"]))), float(above - below))
+
+    @classmethod
+    def mean(cls, orientations: Iterable[Path]) -> PixelSize | None:
+        """Of several tiles' orientation files, those that are there; None of none."""
+        found = [
+            cls.of(json.loads(file.read_text(encoding="utf-8")))
+            for file in orientations
+            if file.is_file()
+        ]
+        if not found:
+            return None
+        return cls(fmean(p.ground_m for p in found), fmean(p.height_m for p in found))

@@ -34,9 +34,8 @@ from ..core.products.provenance import file_sha256
 from ..core.products.rasters import open_raster, write_tiff
 from ..sensor.rpc import RPC
 from ..sensor.rpc_files import rpc_text
-from .layer_kinds import NODATA, LayerKind
-from .manifest import read_manifest
-from .polynomials import evaluate
+from .manifest import NODATA, LayerKind, read_manifest
+from .orientation import evaluate
 
 MARGIN_PX = 16  # of the crops around what the tiles show
 HEIGHTS = {

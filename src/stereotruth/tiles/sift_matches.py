@@ -67,6 +67,21 @@ ENOUGH = 300  # matches in these: with fewer, the others are looked at, too
 PAIRS = 1 << 17  # of key points that are compared at a time
 
 
+FIGURES = (  # columns of the manifest
+    "sift_matches",
+    "sift_mean_error_px",
+    "sift_mean_absolute_error_px",
+    "sift_median_error_px",
+    "sift_gross_share",
+    "y_parallax_median_px",
+    "y_parallax_rms_px",
+)
+MATCH_COLUMNS = (
+    *("city", "scene", "tile", "class", "x", "y", "x_right", "y_right"),
+    *("label_px", "label_bilinear_px", "error_px", "surface_class"),
+)
+
+
 class KeyPoints(NamedTuple):
     """n key points, by rows: position and size in px, angle in degrees, float32[n, 128]."""
 
@@ -209,47 +224,23 @@ class TileMatches:
         return self.y_parallax[np.abs(error - np.median(error)) <= AGREE_PX]
 
     def figures(self) -> dict[str, float | int | None]:
-        """By names of the manifest, px; None where there is no match."""
-        return match_figures(self.row_errors, self.agreeing_parallax)
+        """Of errors (table 4) and of the y-parallax, by names of the manifest; px, share 0 … 1.
 
-
-FIGURES = (
-    "sift_matches",
-    "sift_mean_error_px",
-    "sift_mean_absolute_error_px",
-    "sift_median_error_px",
-    "sift_gross_share",
-    "y_parallax_median_px",
-    "y_parallax_rms_px",
-)
-
-
-def match_figures(errors: Floats, parallax: Floats) -> dict[str, float | int | None]:
-    """Figures of the errors of table 4 and of the y-parallax; px, share 0 … 1, None without any.
-
-    A y-parallax needs ``MIN_PARALLAX`` matches.
-    """
-    values: dict[str, float | int | None] = dict.fromkeys(FIGURES)
-    values["sift_matches"] = errors.size
-    if errors.size:
-        median = float(np.median(errors))
-        values["sift_mean_error_px"] = float(errors.mean())
-        values["sift_mean_absolute_error_px"] = float(np.abs(errors).mean())
-        values["sift_median_error_px"] = median
-        values["sift_gross_share"] = float((np.abs(errors - median) > GROSS_PX).mean())
-    if parallax.size >= MIN_PARALLAX:
-        values["y_parallax_median_px"] = float(np.median(parallax))
-        values["y_parallax_rms_px"] = float(np.sqrt(np.mean(parallax**2)))
-    return values
-
-
-class Places(NamedTuple):
-    """n matches: where in the left and the right image, px."""
-
-    x: Floats
-    y: Floats
-    x_right: Floats
-    y_right: Floats
+        None without any; a y-parallax needs ``MIN_PARALLAX`` matches.
+        """
+        errors, parallax = self.row_errors, self.agreeing_parallax
+        values: dict[str, float | int | None] = dict.fromkeys(FIGURES)
+        values["sift_matches"] = errors.size
+        if errors.size:
+            median = float(np.median(errors))
+            values["sift_mean_error_px"] = float(errors.mean())
+            values["sift_mean_absolute_error_px"] = float(np.abs(errors).mean())
+            values["sift_median_error_px"] = median
+            values["sift_gross_share"] = float((np.abs(errors - median) > GROSS_PX).mean())
+        if parallax.size >= MIN_PARALLAX:
+            values["y_parallax_median_px"] = float(np.median(parallax))
+            values["y_parallax_rms_px"] = float(np.sqrt(np.mean(parallax**2)))
+        return values
 
 
 def _match_band(
@@ -258,21 +249,24 @@ def _match_band(
     where: Bools,
     reach: tuple[float, float],
     first: int,
-) -> Places:
-    """Matches of the left key points in the rows [first, first + BAND) that ``where`` has."""
+) -> Floats:
+    """Matches of the left key points in the rows [first, first + BAND) that ``where`` has.
+
+    [4, n]: x, y in the left image, x, y in the right one, px.
+    """
     start = max(first - APRON, 0)
     rows = slice(start, first + BAND + APRON)
     row = np.arange(len(where))[rows, None]
     here = where[rows] & (row >= first) & (row < first + BAND)
     if not here.any():
-        return Places(*np.empty((4, 0)))
+        return np.empty((4, 0))
     near = (row >= first - ROW_SEARCH_PX - 1) & (row <= first + BAND + ROW_SEARCH_PX)
     there = np.broadcast_to(near, here.shape)
     a, b = _key_points(left[rows], here), _key_points(right[rows], there)
     if not (a.x.size and b.x.size):
-        return Places(*np.empty((4, 0)))
+        return np.empty((4, 0))
     i, j = match(a, b, reach)
-    return Places(a.x[i], a.y[i] + start, b.x[j], b.y[j] + start)
+    return np.stack([a.x[i], a.y[i] + start, b.x[j], b.y[j] + start])
 
 
 def match_tile(
@@ -288,12 +282,12 @@ def match_tile(
         reach = disparity[known].min() - MARGIN_PX, disparity[known].max() + MARGIN_PX
     where, images = constant_labels(disparity), tuple(map(_grey, (left, right)))
     bands = range(0, len(left), BAND)
-    found: dict[int, Places] = {}
+    found: dict[int, Floats] = {}
     for part in (bands[::EVERY], bands):
-        if sum(places.x.size for places in found.values()) < ENOUGH:
+        if sum(places.shape[1] for places in found.values()) < ENOUGH:
             missing = (first for first in part if first not in found)
             found |= {first: _match_band(*images, where, reach, first) for first in missing}
-    x, y, x_right, y_right = (np.concatenate(c) for c in zip(*(found[k] for k in sorted(found))))
+    x, y, x_right, y_right = np.hstack([found[k] for k in sorted(found)])
     at = np.floor(y + 0.5).astype(np.intp), np.floor(x + 0.5).astype(np.intp)
     between = bilinear(disparity, x, y)
     if surface_class is None:
@@ -307,22 +301,6 @@ def match_tile(
         label_bilinear=np.where(np.isfinite(between), between, disparity[at]),
         surface_class=surface_class[at],
     )
-
-
-MATCH_COLUMNS = (
-    "city",
-    "scene",
-    "tile",
-    "class",
-    "x",
-    "y",
-    "x_right",
-    "y_right",
-    "label_px",
-    "label_bilinear_px",
-    "error_px",
-    "surface_class",
-)
 
 
 def match_rows(head: Mapping[str, str], matches: TileMatches) -> list[dict[str, Any]]:

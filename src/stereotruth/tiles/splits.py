@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from ..core.numerics.geometry import metres_per_degree
-from .manifest import Tile, manifest_rows
-from .split_names import NONE, SPLITS
+from .manifest import NONE, SPLITS, Tile, manifest_rows
 
 # Footprints follow the heights on the tile's border; what leans across it by less than this many
 # pixels (a roof 30 m high in a view 5° off nadir at 0.65 m) does not count as shared.

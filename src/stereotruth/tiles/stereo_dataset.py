@@ -33,9 +33,8 @@ from ..core.errors import InputError
 from ..core.products.files import files_below, plain_name, read_sealed
 from ..core.products.provenance import file_sha256
 from ..core.products.rasters import read_disparity, read_labels
-from .layer_kinds import column as column_of
-from .manifest import PATHS, SUM, manifest_rows
-from .split_names import NO_TRUTH, NONE, SPLITS
+from .manifest import NO_TRUTH, NONE, PATHS, SPLITS, SUM, manifest_rows
+from .manifest import column as column_of
 
 LAYOUTS = ("stereotruth", "whu", "kitti", "us3d")
 LEFT_NAMES = {"us3d": "*_LEFT_RGB.tif", "kitti": "image_2/*_10.png"}

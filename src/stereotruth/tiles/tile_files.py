@@ -1,4 +1,4 @@
-"""One tile: its pixels, its files, its row of the manifest."""
+"""One tile: its pixels, its layers, its files, its row of the manifest."""
 
 from __future__ import annotations
 
@@ -11,30 +11,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.configuration import Limits
+from ..core.config.configuration import Export
 from ..core.errors import InputError
 from ..core.numerics.geometry import turn
 from ..core.products.files import link
 from ..core.products.provenance import digest, file_sha256
 from ..core.products.rasters import write_tiff
-from ..core.products.resumable_grids import Ledger
+from ..epipolar.intersection import intersect
 from ..epipolar.warping import agreement, warp_rows
-from .label_surfaces import label_surfaces
-from .layer_kinds import column
+from .label_surfaces import Buildings, heights_above_ground, label_surfaces
+from .manifest import KINDS, NONE, column
 from .orientation import orientation, save
-from .scene_stores import SceneStores
+from .scene_stores import SceneStores, Window
 from .sift_matches import match_tile
-from .split_names import NONE
 from .tile_checks import TileChecks, check_cells, count_sigma
-from .tile_classes import Buildings
-from .tile_layers import tile_layers, write_layer
-from .windows import Window
 
 FILES = ("left", "right", "disp", "status", "orientation")
 RIGHT_FILES = ("disp_right", "status_right")  # labels of the right view, where a scene has them
-
-
 STEPS = 1024  # in a px, of disparities in 32 bits: they compress to little more than half
+MARGIN_PX = 128  # around a tile, from which the ground below its roofs is known
+Slices = tuple[slice, slice]  # rows and columns of a scene's grid
 
 
 def round_disparity(disparity: NDArray[np.floating], dtype: str) -> NDArray[np.float32]:
@@ -44,21 +40,35 @@ def round_disparity(disparity: NDArray[np.floating], dtype: str) -> NDArray[np.f
     return (np.rint(disparity * STEPS) / STEPS).astype(np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """How the tiles of a city are cut and written."""
+@dataclass(frozen=True)
+class City:
+    """A row of the cities sheet: a name, the prefix of its tiles, and tiles of table 3 by split."""
 
     city: str
     prefix: str
-    size: int
-    dtype: str
-    nodata: float
-    building_share: float
-    limits: Limits
+    training: int
+    validation: int
+    testing: int
+
+    @property
+    def split_counts(self) -> dict[str, int]:
+        """Tiles by split, which are scaled to the tiles there are."""
+        return {"train": self.training, "val": self.validation, "test": self.testing}
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """How the tiles of a city are cut and written.
+
+    ``flags``: meaning of the status values of all scenes; ``work``: where the files of finished
+    tiles wait, with the ledger.
+    """
+
+    city: City
+    settings: Export
     code: str
-    flags: Mapping[int, str]  # meaning of the status values of all scenes
-    layers: tuple[str, ...]  # see tile_layers
-    work: Path  # where the files of finished tiles wait, with the ledger
+    flags: Mapping[int, str]
+    work: Path
     provenance: Mapping[str, Any]
 
     @property
@@ -83,30 +93,27 @@ class _Crop:
 
     @classmethod
     def of(cls, source: SceneStores, window: Window, cut: Cut) -> _Crop:
-        rows, start = slice(window.row0, window.row0 + cut.size), window.col0 - window.offset
-        here = (rows, slice(window.col0, window.col0 + cut.size))
-        there = (rows, slice(start, start + cut.size))
+        here = window.of_left(cut.settings.size)
+        there = here[0], slice(here[1].start - window.offset, here[1].stop - window.offset)
         disparity = source.disparity[here].astype(np.float64) - window.offset
         of_right = status_of_right = None
         if window.labelled and source.of_right is not None:
             values = source.of_right["disparity"][there].astype(np.float64) - window.offset
-            of_right = round_disparity(values, cut.dtype)
+            of_right = round_disparity(values, cut.settings.disparity_dtype)
             status_of_right = source.of_right["status"][there]
-        colours = (None, None)
+        colours = dict.fromkeys(("colour_left", "colour_right"))
         if source.colours is not None:
-            colours = (
-                np.stack([band[part] for band in bands])
-                for bands, part in zip(source.colours, (here, there))
-            )
+            for name, bands, part in zip(colours, source.colours, (here, there)):
+                colours[name] = np.stack([band[part] for band in bands])
         return cls(
             left=source.left[here],
             right=source.right[there],
             disparity=disparity,
-            stored=round_disparity(disparity, cut.dtype),
+            stored=round_disparity(disparity, cut.settings.disparity_dtype),
             status=source.status[here],
             of_right=of_right,
             status_of_right=status_of_right,
-            **dict(zip(("colour_left", "colour_right"), colours)),
+            **colours,
         )
 
     def arrays(self) -> list[NDArray[Any]]:
@@ -147,7 +154,7 @@ def _write_images(
     if not window.labelled:
         return
     meanings = ", ".join(f"{value} {meaning}" for value, meaning in source.flags.items())
-    options = {"nodata": cut.nodata, "half": cut.dtype == "float16"}
+    options = {"nodata": cut.settings.nodata, "half": cut.settings.disparity_dtype == "float16"}
     known = np.isfinite(crop.disparity)
     _write_labels(paths["disp"], np.where(known, crop.stored, np.nan), **options)
     write_tiff(paths["status"], crop.status, description=meanings)
@@ -173,14 +180,12 @@ class LabelsKnown:
     def of(
         cls,
         source: SceneStores,
-        here: tuple[slice, slice],
+        here: Slices,
         disparity: NDArray[np.float64],
         building_share: float,
     ) -> LabelsKnown:
         """Of the tile at those rows and columns."""
-        surface_class = np.zeros(disparity.shape, np.uint8)
-        if source.surface_class is not None:
-            surface_class = np.asarray(source.surface_class[here])
+        surface_class = _classes(source, here)
         sigma = np.zeros(disparity.shape)
         if source.uncertainty is not None:
             sigma = np.nan_to_num(np.asarray(source.uncertainty[here], np.float64))
@@ -192,9 +197,49 @@ class LabelsKnown:
             sigma=sigma,
         )
 
-    def arrays(self) -> list[NDArray[Any]]:
-        """All that the checks of a tile follow from, beside its pixels."""
-        return [self.surface_class, self.surface, self.sigma]
+
+def tile_layers(source: SceneStores, here: Slices, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """The layers of a tile at those rows and columns, as their files have them."""
+    if not names:
+        return {}
+    known = np.isfinite(np.asarray(source.disparity[here]))
+    values: dict[str, NDArray[Any]] = {}
+    if "class" in names:
+        values["class"] = _classes(source, here)
+    if "lidar_date" in names:
+        dates = source.lidar_date
+        values["lidar_date"] = np.zeros(known.shape) if dates is None else dates[here]
+    if "uncertainty" in names:
+        sigma = source.uncertainty
+        values["uncertainty"] = np.full(known.shape, np.nan) if sigma is None else sigma[here]
+    if "height" in names or "agl" in names:
+        margin = MARGIN_PX if "agl" in names else 0
+        wide = tuple(
+            slice(max(s.start - margin, 0), min(s.stop + margin, n))
+            for s, n in zip(here, source.left.shape)
+        )
+        part = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(here, wide))
+        disparity = np.asarray(source.disparity[wide], np.float32)
+        ground = intersect(source.model, disparity, wide[0].start, wide[1].start)
+        values["height"] = ground[2][part]
+        if "agl" in names:
+            values["agl"] = heights_above_ground(ground, _classes(source, wide))[part]
+    return {name: _stored(name, values[name], known) for name in names}
+
+
+def _classes(source: SceneStores, window: Slices) -> NDArray[np.uint8]:
+    if source.surface_class is None:
+        return np.zeros(source.left[window].shape, np.uint8)
+    return np.asarray(source.surface_class[window])
+
+
+def _stored(name: str, values: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[Any]:
+    """Values as the file has them: nodata where the pixel has no label."""
+    kind = KINDS[name]
+    dtype = np.dtype(kind.dtype)
+    with np.errstate(invalid="ignore"):
+        good = known & np.isfinite(values.astype(np.float64))
+    return np.where(good, values, kind.nodata).astype(dtype)
 
 
 def _finished(
@@ -204,16 +249,15 @@ def _finished(
 
     A tile is taken over if its pixels, what its checks need, names, settings and code are the same.
     """
-    here = (
-        slice(window.row0, window.row0 + cut.size),
-        slice(window.col0, window.col0 + cut.size),
-    )
-    known = None
+    here, known = window.of_left(cut.settings.size), None
     if window.labelled:
-        known = LabelsKnown.of(source, here, crop.disparity, cut.building_share)
-    layers = tile_layers(source, here, cut.layers) if window.labelled else {}
+        known = LabelsKnown.of(source, here, crop.disparity, cut.settings.building_share)
+    layers = tile_layers(source, here, cut.settings.layers) if window.labelled else {}
     pixels = hashlib.sha256()
-    for array in (*crop.arrays(), *(known.arrays() if known else ()), *layers.values()):
+    arrays = [*crop.arrays(), *layers.values()]
+    if known is not None:  # what the checks follow from, beside the pixels
+        arrays += [known.surface_class, known.surface, known.sigma]
+    for array in arrays:
         pixels.update(array)
     files = {name: path for name, path in names.items() if name != "orientation"}
     paths = {name: cut.work / path for name, path in files.items()}
@@ -221,15 +265,20 @@ def _finished(
         "pixels": pixels.hexdigest(),
         "files": files,
         "flags": [[int(value), meaning] for value, meaning in source.flags.items()],
-        "settings": [cut.dtype, cut.nodata, known.kind if known else ""],
+        "settings": [
+            cut.settings.disparity_dtype,
+            cut.settings.nodata,
+            known.kind if known else "",
+        ],
         "code": cut.code,
     }
-    key, tile = digest(made_of), f"{cut.prefix}_{names['left'].rpartition('_')[2][:-5]}"
+    key, tile = digest(made_of), f"{cut.city.prefix}_{names['left'].rpartition('_')[2][:-5]}"
     piece = cut.ledger.find(tile, key, paths)
     if piece is None:
         _write_images(paths, source, window, crop, cut)
         for name, values in layers.items():
-            write_layer(paths[column(name)], name, values)
+            kind, path = KINDS[name], paths[column(name)]
+            write_tiff(path, values, nodata=kind.nodata, description=kind.description)
         checks = None if known is None else _check(crop, known)
         piece = cut.ledger.put(tile, key, paths, None if checks is None else checks.to_dict())
     found = piece.result
@@ -240,50 +289,48 @@ def write_tile(
     folder: Path, source: SceneStores, window: Window, number: int, cut: Cut
 ) -> tuple[dict[str, Any], NDArray[np.float64], TileChecks | None]:
     """Put a tile into ``folder``: manifest row (without split), ring on the ground, checks."""
-    name = f"{cut.prefix}_{number}"
+    name = f"{cut.city.prefix}_{number}"
     crop = _Crop.of(source, window, cut)
     known, disparity = np.isfinite(crop.disparity), crop.disparity
-    if any((v == cut.nodata).any() for v in (crop.stored, crop.of_right) if v is not None):
+    if any((v == cut.settings.nodata).any() for v in (crop.stored, crop.of_right) if v is not None):
         raise InputError(
-            f"tile {name} has a true disparity of {cut.nodata:g} px, the value for nodata",
+            f"tile {name} has a true disparity of {cut.settings.nodata:g} px, the value for nodata",
             remedy="set tiles.nodata to a value that no disparity takes",
         )
-    files = tile_names(source, window, number, cut.prefix, cut.layers)
+    files = tile_names(source, window, number, cut.city.prefix, cut.settings.layers)
     sums, checks = _finished(source, window, files, crop, cut)
     for kind in sums:
         link(cut.work / files[kind], folder / files[kind])
-    height = source.height[
-        window.row0 : window.row0 + cut.size, window.col0 : window.col0 + cut.size
-    ]
+    height = source.height[window.of_left(cut.settings.size)]
     record = orientation(
         source.model,
         source.sensors,
         row0=window.row0,
         col0=window.col0,
-        size=cut.size,
+        size=cut.settings.size,
         offset=window.offset,
         height=height,
         disparity=np.where(known, crop.stored, np.nan),
     )
-    head = {"tile": name, "city": cut.city, "scene": source.scene, "files": files}
+    head = {"tile": name, "city": cut.city.city, "scene": source.scene, "files": files}
     if source.lidar and (frame := source.lidar.get("frame")):
         head["ground_frame"] = frame
     save(folder / files["orientation"], head | record | {"provenance": cut.provenance})
     sums["orientation"] = file_sha256(folder / files["orientation"])
 
     ring = np.array(record["footprint"]["coordinates"][0][:-1])
-    match = np.arange(cut.size) - disparity
-    inside = (match >= -0.5) & (match <= cut.size - 0.5)
+    match = np.arange(cut.settings.size) - disparity
+    inside = (match >= -0.5) & (match <= cut.settings.size - 0.5)
     values = crop.stored[known].astype(np.float64)
     lon, lat = ring.mean(axis=0)
     row = {
         "tile": name,
         "number": number,
-        "city": cut.city,
+        "city": cut.city.city,
         "scene": source.scene,
         "row0": window.row0,
         "col0": window.col0,
-        "size": cut.size,
+        "size": cut.settings.size,
         "right_offset_px": window.offset,
         "complete": "yes" if window.labelled else "no",
         "split": NONE,
@@ -295,19 +342,19 @@ def write_tile(
         "disparity_rounding_px": (
             f"{np.abs(values - disparity[known]).max():.6f}" if values.size else ""
         ),
-        "disparity_nodata": f"{cut.nodata:g}",
+        "disparity_nodata": f"{cut.settings.nodata:g}",
         "lon": f"{turn(lon):.7f}",
         "lat": f"{lat:.7f}",
         **_lidar_days(source, window, known),
         **_light(source),
-        **check_cells(checks, cut.limits),
+        **check_cells(checks, cut.settings.quality),
     }
     for value, meaning in cut.flags.items():
         row[f"count_{meaning}"] = int((crop.status == value).sum())
     for kind in (
         *FILES,
         *(RIGHT_FILES if source.of_right is not None else ()),
-        *map(column, cut.layers),
+        *map(column, cut.settings.layers),
     ):
         row[kind] = files.get(kind, "")
         row[f"{kind}_sha256"] = sums.get(kind, "")
@@ -321,9 +368,7 @@ def _lidar_days(
     day is known; empty where no such day, or none of the image, is."""
     days = np.empty(0, np.uint16)
     if source.lidar_date is not None:
-        rows, cols = known.shape
-        here = slice(window.row0, window.row0 + rows), slice(window.col0, window.col0 + cols)
-        days = np.asarray(source.lidar_date[here])[known]
+        days = np.asarray(source.lidar_date[window.of_left(len(known))])[known]
         days = np.sort(days[days > 0])
     found: dict[str, int | str] = {}
     for view, taken in zip(("left", "right"), source.acquired):

@@ -10,9 +10,7 @@ from pathlib import Path
 from ..core.errors import InputError
 from ..core.products.files import is_foreign, read_json
 from ..core.products.provenance import file_sha256, own_digest
-from .footprints import FOOTPRINTS, STYLE
-from .manifest import read_manifest
-from .quick_looks import STATUS_COLOURS_FILE
+from .manifest import FOOTPRINTS, STATUS_COLOURS_FILE, STYLE, SUM, read_manifest
 
 log = logging.getLogger("stereotruth")
 
@@ -34,15 +32,12 @@ def defects(folder: str | Path) -> list[str]:
     folder = Path(folder)
     found = []
     listed = set()
-    for row in read_manifest(folder):
-        for kind in (key.removesuffix("_sha256") for key in row if key.endswith("_sha256")):
-            if not (name := row[kind]):
-                continue
-            listed.add(name)
-            if not (folder / name).is_file():
-                found.append(f"{name}: missing")
-            elif file_sha256(folder / name) != row[f"{kind}_sha256"]:
-                found.append(f"{name}: changed")
+    for name, checksum in _listed(folder):
+        listed.add(name)
+        if not (folder / name).is_file():
+            found.append(f"{name}: missing")
+        elif file_sha256(folder / name) != checksum:
+            found.append(f"{name}: changed")
     files = (p for p in folder.rglob("*") if p.is_file())
     # a workflow manager may leave a hidden time stamp of its own
     present = {
@@ -51,7 +46,9 @@ def defects(folder: str | Path) -> list[str]:
         if not p.name.startswith(".") and not _is_foreign(p)
     }
     found += [
-        f"{name}: not in the manifest" for name in sorted(present - listed) if not _is_loose(name)
+        f"{name}: not in the manifest"
+        for name in sorted(present - listed)
+        if not any(fnmatch(name, pattern) for pattern in LOOSE)
     ]
     if (record := folder / "export.json").is_file():
         try:
@@ -68,8 +65,14 @@ def defects(folder: str | Path) -> list[str]:
     return found
 
 
-def _is_loose(name: str) -> bool:
-    return any(fnmatch(name, pattern) for pattern in LOOSE)
+def _listed(folder: Path) -> list[tuple[str, str]]:
+    """Files of a folder that its manifest lists, with their checksums."""
+    return [
+        (row[key.removesuffix(SUM)], row[key])
+        for row in read_manifest(folder)
+        for key in row
+        if key.endswith(SUM) and row[key.removesuffix(SUM)]
+    ]
 
 
 def _is_foreign(path: Path) -> bool:
@@ -95,9 +98,7 @@ def verify(folders: Iterable[str | Path]) -> dict[str, int]:
         bad += [f"{folder}/{line}" for line in found]
         for line in found:
             log.error("%s/%s", folder, line)
-        rows = read_manifest(folder)
-        files = [1 for row in rows for key in row if key.endswith("_sha256") and row[key]]
-        counts[str(folder)] = len(files)
+        counts[str(folder)] = count = len(_listed(folder))
         if foreign := foreign_files(folder):
             more = f" and {len(foreign) - 5} more" if len(foreign) > 5 else ""
             log.info(
@@ -105,7 +106,7 @@ def verify(folders: Iterable[str | Path]) -> dict[str, int]:
                 *(folder, ", ".join(foreign[:5]), more),
             )
         if not found:
-            log.info("%s: %d files as in the manifest", folder, len(files))
+            log.info("%s: %d files as in the manifest", folder, count)
     if bad:
         more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
         raise InputError(

@@ -11,7 +11,7 @@ from stereotruth.align.adjustment import estimate
 from stereotruth.align.equations import Equations
 from stereotruth.align.lack_of_fit import with_shared_errors
 from stereotruth.align.line_fit import LineFit, estimate_with_lines, line_design
-from stereotruth.sensor.line_correction import LineCorrection
+from stereotruth.sensor.rpc import LineCorrection
 
 SIDE = 1100
 ROWS = (SIDE, SIDE)

@@ -16,7 +16,7 @@ from stereotruth.align.refine import refine
 from stereotruth.align.roof_edges import RoofEdges, find_roof_edges
 from stereotruth.align.site_fit import rpc_prior
 from stereotruth.align.tie_equations import read_equations, write_equations
-from stereotruth.sensor.image_reader import open_pair
+from stereotruth.sensor.images import open_pair
 from stereotruth.sensor.rpc import SensorModel
 
 from ...synthetic.box_scene import write_points

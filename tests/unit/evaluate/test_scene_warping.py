@@ -8,7 +8,7 @@ from figures import draw_panels
 from stereotruth.core.products import grids
 from stereotruth.epipolar import warping
 from stereotruth.evaluate.scene_warping import warp_scene
-from stereotruth.tiles import warped_tile
+from stereotruth.tiles import tile_checks
 
 from ...synthetic.truth_scene import write_disparity
 
@@ -43,7 +43,7 @@ def test_warping_finds_the_left_image_again(scene, tmp_path):
     assert warp_scene(*stores, wrong_way).sums.coefficient < 0.9
 
     values = np.rint(texture(x, y))[:64, :64]
-    tile = warped_tile.WarpedTile(
+    tile = tile_checks.WarpedTile(
         "T_1",
         values,
         warping.warp_rows(np.rint(right)[:64], (x - disparity)[:64, :64]),

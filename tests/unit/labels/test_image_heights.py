@@ -26,7 +26,7 @@ from stereotruth.labels.image_heights import (
 )
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import open_stores
-from stereotruth.sensor.shown_ground import GroundOfImages
+from stereotruth.sensor.pair_geometry import GroundOfImages
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import ground_cell
 

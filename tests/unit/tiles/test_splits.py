@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from stereotruth.tiles.split_names import SPLITS
+from stereotruth.tiles.manifest import SPLITS
 from stereotruth.tiles.splits import Place, overlaps, scaled_counts, split_tiles
 
 PAPER = {
@@ -48,8 +48,8 @@ def grid(
     return places
 
 
-@pytest.mark.parametrize("city", PAPER)
-@pytest.mark.parametrize("total", [0, 1, 2, 3, 4, 7, 12, 48, 253, 880, 1757])
+@pytest.mark.parametrize("city", ["Kunming", "Qichun", "Wuhan"])
+@pytest.mark.parametrize("total", [0, 2, 7, 48, 880])
 def test_scaled_counts(city: str, total: int) -> None:
     wanted = weights(city)
     counts = scaled_counts(total, wanted)
@@ -69,7 +69,7 @@ def test_paper_counts_come_back_as_they_are() -> None:
     assert scaled_counts(5, {}) == {"train": 0, "val": 0, "test": 5}
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_counts_are_exact_where_tiles_only_touch(seed: int) -> None:
     places = grid(5, 4)
     assert overlaps(places) == []
@@ -77,6 +77,7 @@ def test_counts_are_exact_where_tiles_only_touch(seed: int) -> None:
     wanted = scaled_counts(20, weights("Qichun"))
     assert {name: found.count(name) for name in SPLITS} == wanted
     assert found == split_tiles(places, weights("Qichun"), seed)
+    assert found != split_tiles(places, weights("Qichun"), seed + 4)  # the seed draws the order
 
 
 def test_splits_are_runs_of_the_sweep_across_rows() -> None:
@@ -87,18 +88,12 @@ def test_splits_are_runs_of_the_sweep_across_rows() -> None:
         assert pieces == 1
 
 
-def test_seed_draws_the_order() -> None:
-    places = grid(6, 4)
-    orders = {tuple(split_tiles(places, weights("Qichun"), seed)) for seed in range(20)}
-    assert len(orders) > 3
-
-
 def assert_apart(places: list[Place], found: list[str]) -> None:
     for i, j in overlaps(places):
         assert "none" in (found[i], found[j]) or found[i] == found[j]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_overlapping_stride(seed: int) -> None:
     places = grid(12, 9, stride=SIZE // 2)
     assert len(overlaps(places)) > 300
@@ -110,7 +105,7 @@ def test_overlapping_stride(seed: int) -> None:
         assert found.count(name) >= wanted[name] - 22 and found.count(name) > 0
 
 
-@pytest.mark.parametrize("turn", [0.2, 0.9, 3.3])
+@pytest.mark.parametrize("turn", [0.2, 3.3])
 def test_two_scenes_of_one_place(turn: float) -> None:
     places = grid(6, 5) + grid(6, 5, scene="b", shift=(210.0, -130.0), turn=turn)
     pairs = overlaps(places)
@@ -128,27 +123,9 @@ def test_scenes_side_by_side_share_nothing() -> None:
     assert len(overlaps(grid(5, 5, turn=0.0) + nearer)) == 5  # corners do not count
 
 
-def test_whole_groups_are_kept_where_that_costs_less() -> None:
-    """Four clusters of overlapping tiles: runs end between clusters."""
-    places = []
-    for k in range(4):
-        places += [
-            Place("a", k * 4096 + r, c, SIZE, p.ring)
-            for r in (0, 512)
-            for c in (0, 512)
-            for p in grid(1, 1, shift=(c * GSD, -(k * 4096 + r) * GSD), turn=0.0)
-        ]
-    found = split_tiles(places, {"train": 9, "val": 0, "test": 7}, 0)
-    assert found.count("none") == 0
-    assert sorted(found.count(name) for name in ("train", "test")) == [8, 8]
-
-
 def test_all_test_and_none_at_all() -> None:
     assert split_tiles([], weights("Wuhan"), 0) == []
     assert set(split_tiles(grid(2, 3, stride=SIZE // 2), weights("Wuhan"), 0)) == {"test"}
     assert split_tiles(grid(1, 1), weights("Qichun"), 0) == ["train"]
-
-
-def test_tiles_that_all_overlap_stay_together() -> None:
-    places = grid(2, 2, stride=SIZE // 4)
-    assert split_tiles(places, weights("Qichun"), 0) == ["train"] * 4
+    together = grid(2, 2, stride=SIZE // 4)  # all overlap
+    assert split_tiles(together, weights("Qichun"), 0) == ["train"] * 4

@@ -48,15 +48,6 @@ def test_the_published_layout_is_read_with_and_without_truth(tmp_path):
         assert all(file.is_file() for p in pairs for file in (p.left, p.right))
 
 
-def test_loose_files_are_of_split_test_and_in_the_order_of_their_numbers(tmp_path):
-    for number in (10, 9, 100):
-        write(tmp_path / f"SG_left_{number}.tiff", np.ones((4, 6), np.uint16))
-        write(tmp_path / f"SG_right_{number}.tiff", np.ones((4, 6), np.uint16))
-    pairs = find_pairs(tmp_path, "whu")
-    assert [p.name for p in pairs] == ["SG_9", "SG_10", "SG_100"]
-    assert {p.split for p in pairs} == {"test"} and pairs[0].disparity is None
-
-
 def test_splits_may_be_links_to_another_disk(tmp_path):
     for split in ("train", "test"):
         whu_pair(tmp_path / "disk" / split, "KM_1")
@@ -66,6 +57,7 @@ def test_splits_may_be_links_to_another_disk(tmp_path):
         (whole / split).symlink_to(tmp_path / "disk" / split)
     (tmp_path / "disk" / "test" / "back").symlink_to(whole)  # leads in a circle
     pairs = find_pairs(whole, "whu")
+    assert [pair.name for pair in pairs] == ["test_KM_1", "train_KM_1"]  # one name in two splits
     assert sorted(p.split for p in pairs) == ["test", "train"]
     assert all(file.is_file() for p in pairs for file in (p.left, p.right, p.disparity))
 
@@ -81,9 +73,6 @@ def test_the_own_layout_follows_its_manifest(tmp_path):
     none, val = find_pairs(tmp_path, "stereotruth")
     assert (val.name, val.city, val.split, val.row["scene"]) == ("ZZ_1", "Zed", "val", "Z-1")
     assert none.split == "none" and none.disparity is None
-    (tmp_path / "x/right/ZZ_right_1.tiff").unlink()
-    with pytest.raises(InputError, match=r"ZZ_right_1\.tiff is missing"):
-        find_pairs(tmp_path, "stereotruth")
 
 
 def test_us3d_may_keep_its_truth_elsewhere(tmp_path):
@@ -99,37 +88,57 @@ def test_us3d_may_keep_its_truth_elsewhere(tmp_path):
     }
 
 
-def test_equal_names_in_two_splits_get_the_split_in_front(tmp_path):
-    for split in ("train", "test"):
-        whu_pair(tmp_path / split, "KM_1")
-    assert [p.name for p in find_pairs(tmp_path, "whu")] == ["test_KM_1", "train_KM_1"]
-    shutil.copytree(tmp_path / "train", tmp_path / "copy" / "train")
-    with pytest.raises(InputError, match="named train_KM_1"):
-        find_pairs(tmp_path, "whu")
+def no_partner(root: Path) -> None:
+    us3d_pair(root, "JAX_1_2_3", ("LEFT_RGB",))
 
 
-def test_what_is_wrong_with_a_folder_is_told(tmp_path):
-    with pytest.raises(InputError, match="no such folder"):
-        find_pairs(tmp_path / "nowhere", "whu")
-    with pytest.raises(InputError, match="no layout 'middlebury'"):
-        find_pairs(tmp_path, "middlebury")
-    us3d_pair(tmp_path, "JAX_1_2_3")
-    with pytest.raises(InputError, match=r"\*_left_\*\.tiff.*layout stereotruth or kitti or us3d"):
-        find_pairs(tmp_path, "whu")
-    (tmp_path / "JAX_1_2_3_RIGHT_RGB.tif").unlink()
-    with pytest.raises(InputError, match=r"partner JAX_1_2_3_RIGHT_RGB\.tif is missing"):
-        find_pairs(tmp_path, "us3d")
-    us3d_pair(tmp_path, "JAX_1_2_3")
-    us3d_pair(tmp_path / "again", "JAX_1_2_3")
-    with pytest.raises(InputError, match="same name"):
-        find_pairs(tmp_path, "us3d")
+def two_of_a_name(root: Path) -> None:
+    us3d_pair(root, "JAX_1_2_3")
+    us3d_pair(root / "again", "JAX_1_2_3")
 
 
-def test_a_labelled_split_must_be_complete(tmp_path):
-    whu_pair(tmp_path / "train", "KM_1")
-    whu_pair(tmp_path / "train", "KM_2", kinds=("left", "right"))
-    with pytest.raises(InputError, match=r"partner KM_disparity_2\.tiff is missing"):
-        find_pairs(tmp_path, "whu")
+def not_all_labels(root: Path) -> None:
+    whu_pair(root / "train", "KM_1")
+    whu_pair(root / "train", "KM_2", kinds=("left", "right"))
+
+
+def twice(root: Path) -> None:
+    whu_pair(root / "train", "KM_1")
+    shutil.copytree(root / "train", root / "copy" / "train")
+
+
+def odd_name(*files: str):
+    def make(root: Path) -> None:
+        for file in files:
+            (root / file).parent.mkdir(parents=True, exist_ok=True)
+            (root / file).touch()
+
+    return make
+
+
+REFUSED = {
+    "nothing of the layout": ("whu", lambda root: us3d_pair(root, "JAX_1_2_3")),
+    "no such layout": ("middlebury", lambda root: None),
+    "no partner": ("us3d", no_partner),
+    "a name twice": ("us3d", two_of_a_name),
+    "a pair twice": ("whu", twice),
+    "labels missing": ("whu", not_all_labels),
+    # names of files become names of products, and keys of tables
+    "backslash": ("whu", odd_name("S\\G_left_1.tiff", "S\\G_right_1.tiff")),
+    "bell": ("us3d", odd_name("A\aB_LEFT_RGB.tif", "A\aB_RIGHT_RGB.tif")),
+    "dots": ("kitti", odd_name("image_2/.._10.png", "image_3/.._10.png")),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_folders_that_cannot_be_used_are_refused(tmp_path, fault):
+    layout, make = REFUSED[fault]
+    make(tmp_path)
+    with pytest.raises(InputError) as refused:
+        find_pairs(tmp_path, layout)
+    assert refused.value.file and refused.value.remedy
+    with pytest.raises(InputError):
+        find_pairs(tmp_path / "nowhere", layout)
 
 
 def test_a_split_without_pairs_is_refused(tmp_path):
@@ -137,9 +146,9 @@ def test_a_split_without_pairs_is_refused(tmp_path):
     settings = {"root": str(tmp_path), "layout": "whu", "disparity_range": [-8, 8]}
     dataset = StereoDataset.of("mine", settings)
     assert len(dataset.pairs("train", labelled=True)) == 1
-    with pytest.raises(InputError, match=r"no labelled pairs of split 'test'; pairs:.*train"):
+    with pytest.raises(InputError):
         dataset.pairs("test", labelled=True)
-    with pytest.raises(InputError, match="is empty"):
+    with pytest.raises(InputError):
         StereoDataset.of("mine", settings | {"disparity_range": [8, 8]})
 
 
@@ -152,19 +161,3 @@ def test_the_published_pairs_are_found():
     assert 0.1 < np.isnan(labels).mean() < 0.3 and np.nanmin(labels) > -96
     (pair,) = find_pairs(PUBLISHED / "whu", "whu")
     assert (pair.name, pair.city, pair.disparity) == ("KM_253", "Kunming", None)
-
-
-def test_names_of_files_that_are_no_plain_names_are_refused(tmp_path):
-    """They become names of products, and of keys of tables."""
-    for layout, left, right in (
-        ("whu", "S\\G_left_1.tiff", "S\\G_right_1.tiff"),
-        ("us3d", "A\aB_LEFT_RGB.tif", "A\aB_RIGHT_RGB.tif"),
-        ("kitti", "image_2/.._10.png", "image_3/.._10.png"),
-        ("whu", f"{'x' * 110}_left_1.tiff", f"{'x' * 110}_right_1.tiff"),
-    ):
-        root = tmp_path / str(len(left)) / layout
-        for file in (left, right):
-            (root / file).parent.mkdir(parents=True, exist_ok=True)
-            (root / file).touch()
-        with pytest.raises(InputError, match="the name of a pair, "):
-            find_pairs(root, layout)

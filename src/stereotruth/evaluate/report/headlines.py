@@ -14,8 +14,8 @@ import numpy as np
 
 from ...pages.tables import Headline, joined, metres, minus, missed, number, spread
 from ...tiles.label_doubts import ABOUT, ALIGNMENT, LIDAR
+from ...tiles.manifest import NONE, SPLITS
 from ...tiles.sift_matches import SIFT_NOISE_PX
-from ...tiles.split_names import NONE, SPLITS
 
 Rows = Sequence[Mapping[str, str]]
 Records = Mapping[str, Mapping[str, Any]]

@@ -21,8 +21,7 @@ from ...core.status import carries_label
 from ...pages.page import INDEX, way, write_page
 from ...pages.pictures import colours, encode, shrink, stretch
 from ...pages.tables import EMPTY, Cell, Column, Headline, Table, link_cell, spread, value_cell
-from ...tiles.manifest import read_manifest
-from ...tiles.split_names import SPLITS
+from ...tiles.manifest import SPLITS, read_manifest
 
 PAGES = (
     "results/report/*/index.html",

@@ -14,8 +14,7 @@ import rasterio
 from ...pages.figures import AXES, Chart, Plot, look, on_the_ground, styled
 from ...pages.pictures import SERIES, shrink
 from ...pages.tables import minus, missed
-from ...tiles.footprints import read_footprints
-from ...tiles.quick_looks import SPLIT_COLOURS
+from ...tiles.quick_looks import SPLIT_COLOURS, read_footprints
 
 PICTURE_PX = 1000
 MARGIN = 0.03  # of the longer side, around all footprints

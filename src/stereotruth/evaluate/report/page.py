@@ -23,10 +23,9 @@ from ...core.products.files import read_table
 from ...pages.page import way, write_page
 from ...pages.pictures import DISPARITIES, Scale, encode_file
 from ...pages.tables import Table, cells_of, columns_of, limit, minus, missed, table, texts, words
-from ...tiles.manifest import read_manifest
-from ...tiles.pixel_size import PixelSize
+from ...tiles.manifest import NONE, SPLITS, read_manifest
+from ...tiles.orientation import PixelSize
 from ...tiles.quick_looks import SPLIT_COLOURS, status_colours
-from ...tiles.split_names import NONE, SPLITS
 from . import tile_pictures
 from .headlines import headlines
 from .maps import calibration, histograms, tile_map

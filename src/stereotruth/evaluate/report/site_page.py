@@ -14,10 +14,8 @@ from ...pages.figures import AXES, Chart, Plot, look, on_the_ground, styled
 from ...pages.page import way, write_page
 from ...pages.pictures import DISPARITIES, Scale
 from ...pages.tables import Table, table
-from ...sensor.linked_images import Links
 from ...sensor.pair_geometry import ray_upwards
-from ...sensor.pair_quality import RatedPair
-from ...sensor.site_pairs import SiteImage
+from ...sensor.site_pairs import Links, RatedPair, SiteImage
 
 TEMPLATE = Path(__file__).with_name("site_page.html.jinja")
 FIRST_DAY = 1.0  # below it, the axis of days is linear

@@ -15,7 +15,7 @@ from ...pages import pictures
 from ...pages.pictures import Layer, Picture, Scale, encode, hillshade
 from ...pages.tables import minus
 from ...tiles.quick_looks import status_colours
-from ...tiles.warped_tile import warp_tile
+from ...tiles.tile_checks import warp_tile
 
 NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
 GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen

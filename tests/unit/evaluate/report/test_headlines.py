@@ -7,7 +7,7 @@ import re
 import pytest
 
 from stereotruth.evaluate.report.headlines import headlines
-from stereotruth.tiles.summary import summary_lines
+from stereotruth.tiles.tile_checks import summary_lines
 
 SCENE = {
     "gcp_rms_px": 0.3,

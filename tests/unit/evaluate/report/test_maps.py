@@ -10,7 +10,7 @@ import re
 import numpy as np
 
 from stereotruth.evaluate.report.maps import calibration, histograms, tile_map
-from stereotruth.tiles.footprints import feature, write_footprints
+from stereotruth.tiles.quick_looks import feature, write_footprints
 
 LAT = 45.0
 

@@ -11,7 +11,7 @@ import numpy as np
 from stereocities.sites import drawn_site
 from stereotruth.core.numerics.geometry import metres_per_degree
 from stereotruth.evaluate.report.site_page import write_site_page
-from stereotruth.sensor.pair_quality import rate
+from stereotruth.sensor.site_pairs import rate
 
 from ....browser import look, needs_chromium
 from ....synthetic.site_sensors import exact_image

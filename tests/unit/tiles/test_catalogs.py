@@ -1,16 +1,20 @@
-"""The dataset as a STAC collection, read by pystac."""
+"""The dataset as a STAC collection, read by pystac, and as Croissant, loaded by mlcroissant."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import shutil
+import sys
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+from PIL import Image
 
+mlc = pytest.importorskip("mlcroissant", reason="the extra catalog is not installed")
 pystac = pytest.importorskip("pystac", reason="the extra catalog is not installed")
 
 from pystac.extensions.file import FileExtension
@@ -20,12 +24,11 @@ from pystac.validation.stac_validator import JsonSchemaSTACValidator
 
 from stereotruth.core.errors import InputError
 from stereotruth.sensor.rpc import RPC
-from stereotruth.sensor.rpc_files import read_rpc
-from stereotruth.tiles.published_layout import assemble_dataset
+from stereotruth.sensor.rpc_files import rpc_text
+from stereotruth.tiles.layouts import assemble_dataset
 from stereotruth.tiles.verify import defects
 
-from ...synthetic.images import write
-from ...synthetic.tiled_scene import SIZE, rows_of
+from ...synthetic.tiled_scene import SIZE, read, rows_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -42,6 +45,10 @@ def test_the_collection_holds_an_item_of_each_pair(dataset) -> None:
     collection = pystac.Collection.from_file(str(dataset / "stac/collection.json"))
     items = {item.id: item for item in collection.get_items()}
     rows = rows_of(dataset)
+    for asset in collection.assets.values():
+        assert Path(asset.get_absolute_href()).is_relative_to(dataset)
+        assert Path(asset.get_absolute_href()).is_file()
+    assert defects(dataset) == []
     assert set(items) == {row["tile"] for row in rows}
     places = {
         one["id"]: one["geometry"]
@@ -61,9 +68,13 @@ def test_the_collection_holds_an_item_of_each_pair(dataset) -> None:
         assert not item.properties["stereotruth:acquisition_known"]
         wanted = {"left", "right", "orientation", "left_rpc", "right_rpc"}
         assert set(item.assets) == wanted | ({"disparity"} if row["disp"] else set())
+        record = json.loads((dataset / row["orientation"]).read_text())
         for name, asset in item.assets.items():
             path = Path(asset.get_absolute_href())
             assert not Path(asset.href).is_absolute() and path.is_relative_to(dataset)
+            if name.endswith("_rpc"):
+                told = record[name.removesuffix("_rpc")]["corrected_rpc"]
+                assert path.read_text() == rpc_text(RPC.from_dict(told))
             said = FileExtension.ext(asset)
             assert said.size == path.stat().st_size
             assert said.checksum == "1220" + hashlib.sha256(path.read_bytes()).hexdigest()
@@ -77,30 +88,49 @@ def test_the_collection_holds_an_item_of_each_pair(dataset) -> None:
     assert whole == [*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0)]
 
 
-def test_rpcs_are_those_of_the_orientation_files(dataset, tmp_path) -> None:
-    row = rows_of(dataset)[0]
-    record = json.loads((dataset / row["orientation"]).read_text())
-    for view in ("left", "right"):
-        write(tmp_path / f"{view}.tif", np.zeros((4, 4), np.uint8))
-        text = dataset / f"stac/rpc/{row['scene']}_{view}_RPC.TXT"
-        shutil.copyfile(text, tmp_path / f"{view}_RPC.TXT")
-        wanted = RPC.from_dict(record[view]["corrected_rpc"])
-        assert read_rpc(tmp_path / f"{view}.tif").to_dict() == wanted.to_dict()
-
-
-def test_verify_knows_its_files(dataset, tmp_path) -> None:
-    assert defects(dataset) == []
-    shutil.copytree(dataset, tmp_path / "d")
-    item = tmp_path / "d" / rows_of(dataset)[0]["item"]
-    item.write_text(item.read_text() + " ")
-    assert defects(tmp_path / "d") == [f"{item.relative_to(tmp_path / 'd')}: changed"]
-
-
 def test_dates_are_told(exported, tmp_path) -> None:
     scene = rows_of(exported[0])[0]["scene"]
     out = tmp_path / "out"
-    with pytest.raises(InputError, match=f"dataset.acquired.{scene}: 'May' is no date"):
+    with pytest.raises(InputError):
         assemble_dataset([exported[0]], out, catalogs=["stac"], acquired={scene: "May"})
     assemble_dataset([exported[0]], out, catalogs=["stac"], acquired={scene: "2020-10-25"})
     collection = pystac.Collection.from_file(str(out / "stac/collection.json"))
     assert all(str(i.datetime.date()) == "2020-10-25" for i in collection.get_items())
+
+
+# ------------------------------------------------------------------ Croissant
+
+
+def test_the_pairs_are_loaded(exported, tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    assemble_dataset([exported[0]], folder, catalogs=["croissant"])
+    assert defects(folder) == []
+    dataset = mlc.Dataset(jsonld=str(folder / "croissant.json"))
+    assert not dataset.metadata.issues.errors
+    pairs = [
+        {key.partition("/")[2]: value for key, value in one.items()}
+        for one in dataset.records("pairs")
+    ]
+    rows = rows_of(folder)
+    assert [one["tile"].decode() for one in pairs] == [row["tile"] for row in rows]
+    for one, row in zip(pairs, rows):
+        assert one["split"].decode() == row["split"]
+        assert one["right_offset_px"] == int(row["right_offset_px"])
+        assert (one["disp"] is None) == (row["disp"] == "")
+        for kind in ("left", "right", *(("disp",) if row["disp"] else ())):
+            with Image.open(folder / one[kind].decode()) as image:
+                np.testing.assert_array_equal(np.asarray(image), read(folder / row[kind]))
+    sets = {one.id: one.includes for one in dataset.metadata.distribution if one.id != "manifest"}
+    files = [p.relative_to(folder).as_posix() for p in folder.rglob("*.tiff")]
+    for kind, column in (("left", "left"), ("right", "right"), ("disparity", "disp")):
+        found = [f for f in files if any(fnmatch(f, one) for one in sets[f"{kind}-files"])]
+        assert sorted(found) == sorted(row[column] for row in rows if row[column])
+
+
+def test_without_the_extra_it_is_said_how_to_get_it(exported, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "mlcroissant", None)
+    monkeypatch.delitem(sys.modules, "stereotruth.tiles.catalogs", raising=False)
+    monkeypatch.delattr("stereotruth.tiles.catalogs", raising=False)
+    with pytest.raises(InputError, match=r"croissant needs mlcroissant.*the extra catalog"):
+        assemble_dataset([exported[0]], tmp_path / "out", catalogs=["croissant"])
+    assert not (tmp_path / "out").exists()

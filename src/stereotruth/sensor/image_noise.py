@@ -1,19 +1,18 @@
-"""Noise of two images of the same ground, and images in which it is the same everywhere.
+"""Noise of two images of the same ground, images in which it is the same everywhere, their detail.
 
-Noise is not one number. A tone curve makes it several times greater in shadow than in the light,
-and resampling, pan-sharpening and compression leave noise whose neighbours correlate, of which one
-image alone tells too little: it looks like texture that optics have blurred.
+Noise is not one number (docs/explanation/real_sensors.md): it follows the brightness, and its
+neighbours may correlate, of which one image alone tells too little.
 
-1. *By brightness*: the second differences along rows and columns remove all of a plane and most of
-   a texture that optics have blurred (Immerkaer, CVIU 64, 1996). Where an image is flattest, at
-   each brightness, they give the noise but for a factor, which is the same at all.
+1. *By brightness*: second differences along rows and columns (Immerkaer, CVIU 64, 1996), where an
+   image is flattest at each brightness, give the noise but for a factor, the same at all.
 2. *The factor*: parts of the left image are looked for along their rows in the right one. Where the
    ground is flat, noise is all that both images differ by.
 3. *Equal noise*: brightness is counted in standard deviations of the noise, so that it is the same
-   at all places and in all images: a variance-stabilising transformation (Anscombe 1948). Whoever
-   compares two images then needs to know neither their bits nor their tone curve.
+   at all places and in all images: a variance-stabilising transformation (Anscombe 1948).
 
-The LiDAR has no say, so that more of it changes nothing.
+The *detail* of an image is what remains of it where shadows and another sun change its brightness:
+each pixel's deviation from the mean of the pixels around it, in standard deviations of these and of
+the noise. Only at a shadow's edge is it another than on lit ground, by GREATEST at most.
 """
 
 from __future__ import annotations
@@ -24,10 +23,13 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .model import EpipolarModel
+from ..core.kernels import kernel
+from ..core.numerics.windows import window_sums
 
+Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 
 STEPS = 8.0  # whole numbers that a standard deviation of the noise spans in images of equal noise
 EQUAL = STEPS**2, STEPS**2  # variances of the noise of two such images
@@ -44,6 +46,14 @@ LEAST, LEAST_OF_NOISE = 0.05, 0.7
 ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers
 LEAST_SHARE = 0.003  # of the brightness: no two images of the same ground differ by less
 VALUES = 1 << 16  # of uint16
+
+AROUND_PX = 5  # side of what a pixel is compared with for its detail
+GREATEST = 1.5  # standard deviations
+MEAN = 10.0  # of the detail, so that none of its values is 0, which is nodata
+NOISE_SHARE = 2.0  # variances of the noise that are added to that of the pixels
+SIGNAL_PX = 9  # side of what the share of the signal is the mean of
+WHOLE = 1000  # parts of a share
+LEAST_DN2 = 1.0  # variance by rounding, at least
 
 
 class Grid(Protocol):
@@ -85,12 +95,15 @@ class Parts(NamedTuple):
     variance: Floats
 
 
-def pair_noise(left: Grid, right: Grid, model: EpipolarModel) -> tuple[NoiseCurve, NoiseCurve]:
-    """Of both images of an epipolar pair, by what they differ by.
+def pair_noise(
+    left: Grid, right: Grid, disparities: tuple[int, int]
+) -> tuple[NoiseCurve, NoiseCurve]:
+    """Of both images of an epipolar pair, by what they differ by at ``disparities`` (least and
+    greatest, px) that they may have.
 
     No more than rounding where no part of the images can be compared.
     """
-    parts = _parts_of(left, right, _disparities(model))
+    parts = _parts_of(left, right, disparities)
     curves = [_by_brightness(*of_image) for of_image in zip(*parts[:3])]
     expected = sum(
         np.interp(level, curve.brightness, curve.deviation) ** 2 * gain**2
@@ -106,15 +119,6 @@ def pair_noise(left: Grid, right: Grid, model: EpipolarModel) -> tuple[NoiseCurv
         NoiseCurve(curve.brightness, tuple(factor * value for value in curve.deviation))
         for curve in curves
     )
-
-
-def _disparities(model: EpipolarModel) -> tuple[int, int]:
-    """Least and greatest, px, of the heights of the model."""
-    rows, cols = model.shape
-    axes = np.linspace(0.0, cols - 1.0, 5), np.linspace(0.0, rows - 1.0, 5), model.height_range
-    x, y, height = (grid.reshape(-1) for grid in np.meshgrid(*axes))
-    there = model.ground_to_epipolar(*model.epipolar_to_ground(x, y, height), height)[2]
-    return int(np.floor(np.nanmin(x - there))), int(np.ceil(np.nanmax(x - there)))
 
 
 def _parts_of(left: Grid, right: Grid, disparities: tuple[int, int]) -> Parts:
@@ -224,3 +228,49 @@ def _by_brightness(brightness: Floats, _greatest: Floats, rough: Floats) -> Nois
     if not levels:
         return NoiseCurve((0.0,), (float(np.sqrt(ROUNDING)),))
     return NoiseCurve(tuple(levels), tuple(deviations))
+
+
+def detail(
+    image: NDArray[np.floating], noise: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Detail [h, w] of an image [h, w] of whole numbers (DN), by the variance of its ``noise``; and
+    the share of it that is signal, over the SIGNAL_PX² around each pixel.
+
+    0 near the edge of the image, and the detail also within AROUND_PX // 2 px of nodata (0).
+    """
+    out, signal = np.zeros((2, *image.shape), np.float32)
+    if min(image.shape) < AROUND_PX + SIGNAL_PX:
+        return out, signal
+    half, count = AROUND_PX // 2, AROUND_PX**2
+    whole = image.astype(np.int64)
+    total = window_sums(whole, AROUND_PX)  # exact, so that no block changes it
+    squares = count * window_sums(whole * whole, AROUND_PX) - total * total
+    has_values = window_sums(whole == 0, AROUND_PX) == 0
+    inner = np.s_[half:-half, half:-half]
+    _fill_deviations(whole[inner], has_values, count, total, squares, noise, out[inner])
+    variance = squares / count**2
+    share = WHOLE * (1.0 - noise / np.maximum(variance, max(noise, LEAST_DN2)))
+    half += SIGNAL_PX // 2
+    parts = window_sums(share.astype(np.int64), SIGNAL_PX)
+    signal[half:-half, half:-half] = parts / (WHOLE * SIGNAL_PX**2)
+    return out, signal
+
+
+@kernel
+def _fill_deviations(
+    values: Ints,
+    here: Bools,
+    n: int,
+    total: Ints,
+    squares: Ints,
+    noise: float,
+    out: NDArray[np.floating],
+) -> None:
+    """Of ``values`` [h, w] from the mean of ``n`` pixels of the sum ``total``, whose variance
+    is ``squares`` / n²; with MEAN. To ``out``, at the pixels ``here``."""
+    for j in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            if here[j, i]:
+                deviation = (n * values[j, i] - total[j, i]) / n
+                deviation /= np.sqrt(squares[j, i] / (n * n) + NOISE_SHARE * noise + LEAST_DN2)
+                out[j, i] = min(max(deviation, -GREATEST), GREATEST) + MEAN

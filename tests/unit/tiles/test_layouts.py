@@ -1,7 +1,8 @@
-"""The dataset as KITTI and US3D have theirs: read back by the project's readers, and by others."""
+"""The dataset, and its other layouts by several readers."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -9,37 +10,77 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stereotruth.core.errors import InputError
 from stereotruth.core.products.rasters import read_disparity, read_image
-from stereotruth.tiles.other_layouts import moved, shift_of, write_layout
-from stereotruth.tiles.published_layout import assemble_dataset
+from stereotruth.tiles.layouts import assemble_dataset, write_layout
 from stereotruth.tiles.stereo_dataset import StereoDataset
 from stereotruth.tiles.verify import defects
 
 from ...synthetic.images import write
 from ...synthetic.other_programs import PROGRAMS
-from ...synthetic.tiled_scene import SIZE, labels, make_scene, rows_of, run
+from ...synthetic.tiled_scene import SIZE, labels, rows_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 RANGE = (-64, 200)
 
 
-@pytest.fixture(scope="module")
-def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder, found = tmp_path_factory.mktemp("dataset"), {}
-    for kind in ("grey", "colour"):
-        scene = make_scene(folder / kind / "s1", bare_from=240, colour=kind == "colour")
-        run([scene], folder / kind / "Town")
-        found[kind] = folder / kind / "dataset"
-        assemble_dataset([folder / kind / "Town"], found[kind])
-    return found
+def renamed(folder: Path, out: Path) -> Path:
+    """The same tiles as another city, with training and testing exchanged."""
+    shutil.copytree(folder, out)
+    for file in out.rglob("TN_*"):
+        file.rename(file.with_name(file.name.replace("TN_", "AA_")))
+    for file in (out / "manifest.csv", out / "footprints.geojson"):
+        file.write_text(file.read_text().replace("TN_", "AA_"))
+    table = (out / "manifest.csv").read_text()
+    for one, other in ((",train,", ",?,"), (",test,", ",train,"), (",?,", ",test,")):
+        table = table.replace(one, other)
+    (out / "manifest.csv").write_text(table)
+    return out
 
 
-@pytest.fixture(scope="module", params=["kitti-grey", "kitti-colour", "us3d-grey", "us3d-colour"])
-def written(request, datasets, tmp_path_factory) -> tuple[str, Path, Path]:
+def test_published_layout(exported, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    cities, out = [exported[0], renamed(exported[0], tmp_path / "B")], tmp_path / "dataset"
+    summary = assemble_dataset(cities, out)
+    given = [row for city in cities for row in rows_of(city)]
+    assert sum(summary["pairs"].values()) == len(given)
+    one, other = summary["shared_ground"][0]
+    assert {one[:2], other[:2]} == {"TN", "AA"} and f"{one} and {other} share" in caplog.text
+    rows = rows_of(out)
+    for row, before in zip(rows, given):
+        place = f"with ground truth/{row['split']}" if row["disp"] else "without ground truth"
+        for kind in ("left", "right", *(("disp",) if row["disp"] else ())):
+            assert row[kind] == f"{place}/{kind}/{Path(before[kind]).name}"
+            assert (out / row[kind]).is_file()
+    assert defects(out) == [] and "orientation" not in rows[0]
+    (out / rows[0]["left"]).write_text("edited")  # a copy: the tiles stay
+    assert defects(cities[0]) == [] and len(defects(out)) == 1
+    assemble_dataset(cities, out)  # replaces what was there
+    assert defects(out) == []
+
+
+def test_refusals(exported, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="TN_0 is in"):
+        assemble_dataset([exported[0], exported[0]], tmp_path / "d")
+    city = renamed(exported[0], tmp_path / "A")
+    (city / "right" / "AA_right_1.tiff").write_text("edited")
+    for folder in (tmp_path / "nowhere", city):
+        with pytest.raises(InputError):
+            assemble_dataset([folder], tmp_path / "d")
+    assert not (tmp_path / "d").exists() and not list(tmp_path.glob("*.partial"))
+
+
+# ------------------------------------------------------------------ other layouts
+
+
+@pytest.fixture(scope="module", params=["kitti-grey", "us3d-colour"])
+def written(request, exported, in_colour, tmp_path_factory) -> tuple[str, Path, Path]:
     layout, kind = request.param.split("-")
-    out = tmp_path_factory.mktemp("layout") / layout
-    assert write_layout(datasets[kind], out, layout) >= 10
-    return layout, datasets[kind], out
+    folder = tmp_path_factory.mktemp("layout")
+    dataset, out = folder / "dataset", folder / layout
+    assemble_dataset([(exported if kind == "grey" else in_colour)[0]], dataset)
+    assert write_layout(dataset, out, layout) >= 10
+    assert defects(out) == []
+    return layout, dataset, out
 
 
 def test_the_readers_give_the_same_disparities(written) -> None:
@@ -69,28 +110,6 @@ def test_the_readers_give_the_same_disparities(written) -> None:
         assert np.corrcoef(a, b)[0, 1] > 0.98
 
 
-def test_images_are_those_of_the_tiles(written) -> None:
-    layout, dataset, out = written
-    ours = {p.name: p for p in StereoDataset("a", dataset, "stereotruth", RANGE).pairs()}
-    for row in rows_of(out)[::5]:
-        left, right = (read_image(out / row[view]) for view in ("left", "right"))
-        one = ours[row["tile"]]
-        images = read_image(one.left), read_image(one.right)
-        if layout == "kitti":
-            shift = int(row["shift_px"])
-            np.testing.assert_array_equal(left, images[0])
-            np.testing.assert_array_equal(right[:, : SIZE - shift], images[1][:, shift:])
-            assert (right[:, SIZE - shift :] == 0).all()
-            continue
-        low, high = float(row["black"]), float(row["white"])
-        for found, image in zip((left, right), images):
-            assert found.shape == (SIZE, SIZE, 3) and found.dtype == np.uint8
-            image = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-            back = low + (found.astype(float) - 1) * (high - low) / 254
-            inside = (image > low) & (image < high)
-            assert np.abs(back - image)[inside].max() <= (high - low) / 254
-
-
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_every_program_opens_them(written, program: str) -> None:
     layout, _, out = written
@@ -107,18 +126,6 @@ def test_every_program_opens_them(written, program: str) -> None:
     if image.dtype == np.uint8 and wanted.dtype == np.uint16:
         wanted = wanted >> 8  # Pillow has 8 bits of each colour
     np.testing.assert_array_equal(image, wanted)
-
-
-def test_checksums_hold(written, tmp_path) -> None:
-    _, _, out = written
-    assert defects(out) == []
-
-
-def test_disparities_of_png_are_positive() -> None:
-    assert shift_of(np.array([[np.nan, -3.2, 7.0]], np.float32)) == 5
-    assert shift_of(np.array([[2.0, np.nan]], np.float32)) == 0
-    assert moved(np.array([[1, 2, 3, 4]]), 3).tolist() == [[4, 0, 0, 0]]
-    assert not moved(np.array([[1, 2]]), 9).any()
 
 
 def test_kittis_own_files_are_read(tmp_path) -> None:

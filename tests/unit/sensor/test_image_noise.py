@@ -1,25 +1,16 @@
-"""The noise of two images of the same ground by brightness, and images of equal noise."""
+"""Noise of two images of the same ground, images of equal noise, and their detail."""
 
 from __future__ import annotations
-
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from stereotruth.epipolar.image_noise import STEPS, NoiseCurve, pair_noise
-from stereotruth.epipolar.surface_windows import correlation_and_expected
+from stereotruth.sensor.image_noise import GREATEST, MEAN, STEPS, NoiseCurve, detail, pair_noise
 
 SIDE = 400
-LEVEL = np.zeros((2, SIDE, SIDE), np.float32)
 SHIFT = 7  # px of disparity
-MODEL = SimpleNamespace(
-    shape=(SIDE, SIDE),
-    height_range=(-30.0, 30.0),
-    epipolar_to_ground=lambda x, y, height: (x, y),
-    ground_to_epipolar=lambda lon, lat, height: np.stack([lon, lat, lon - height, lat]),
-)
+DISPARITIES = -30, 30
 
 
 def texture(seed: int, contrast: float) -> np.ndarray:
@@ -48,7 +39,7 @@ def shaded_pair(blur: float) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("blur", [0.0, 0.55])
 def test_noise_is_known_by_brightness_whether_its_neighbours_correlate(blur: float) -> None:
-    curves = pair_noise(*shaded_pair(blur), MODEL)
+    curves = pair_noise(*shaded_pair(blur), DISPARITIES)
     for curve in curves:
         dark, lit = np.interp([80.0, 200.0], curve.brightness, curve.deviation)
         assert dark == pytest.approx(6.0, rel=0.25)
@@ -57,7 +48,7 @@ def test_noise_is_known_by_brightness_whether_its_neighbours_correlate(blur: flo
 
 def test_noise_of_images_without_ground_in_common_is_rounding_at_least() -> None:
     nothing = np.zeros((SIDE, SIDE), np.uint16)
-    for curve in pair_noise(nothing, nothing, MODEL):
+    for curve in pair_noise(nothing, nothing, DISPARITIES):
         assert curve.deviation == pytest.approx((12.0**-0.5,))
 
 
@@ -73,15 +64,45 @@ def test_images_of_equal_noise_have_the_same_at_all_brightness() -> None:
     assert equal[0] == 0.0 and (equal[1:] > 0.0).all() and (np.diff(equal) >= 0.0).all()
 
 
-@pytest.mark.parametrize("contrast", [10.0, 20.0])
-def test_expected_correlation_is_that_of_the_same_ground(contrast: float) -> None:
-    """On the average, where there is enough of it."""
-    sigma, ground = 10.0, texture(3, contrast)
-    left, right = (noisy(ground, sigma, seed).astype(np.float32) for seed in (4, 5))
-    noise = (sigma**2, sigma**2)
-    found, expected = correlation_and_expected(left, right, LEVEL[0], LEVEL, 9, noise)
-    attenuated = contrast**2 / (contrast**2 + sigma**2)  # Spearman
-    told = np.isfinite(expected)
-    assert told.mean() > 0.9
-    assert expected[told].mean() == pytest.approx(attenuated, abs=0.08)
-    assert found[told].mean() == pytest.approx(expected[told].mean(), abs=0.1)
+# ------------------------------------------------------------------ detail
+
+
+def speckle(seed: int = 0, spread: float = 150.0) -> np.ndarray:
+    return np.round(np.random.default_rng(seed).normal(900.0, spread, (60, 70)))
+
+
+def test_a_shadow_has_the_detail_of_the_lit_ground() -> None:
+    """A fifth of the brightness and of the contrast; only beside its edge is the detail another."""
+    lit = speckle()
+    shadowed = lit.copy()
+    shadowed[:, 40:] = np.round(lit[:, 40:] / 5.0)
+    expected, _ = detail(lit, 0.0)
+    found, _ = detail(shadowed, 0.0)
+    assert (found[:, :38] == expected[:, :38]).all()
+    assert found[2:-2, 42:-2] == pytest.approx(expected[2:-2, 42:-2], abs=0.05)
+    assert np.abs(found[2:-2, 2:-2] - MEAN).max() <= GREATEST
+
+
+def test_there_is_none_beside_nodata() -> None:
+    image = speckle()
+    image[30, 30] = 0.0
+    found, _ = detail(image, 0.0)
+    empty = np.zeros(image.shape, np.bool_)
+    empty[28:33, 28:33] = empty[:2] = empty[-2:] = empty[:, :2] = empty[:, -2:] = True
+    assert ((found == 0.0) == empty).all()
+
+
+def test_signal_is_what_exceeds_the_noise() -> None:
+    """White noise alone has no signal; texture of four times its deviation has 16 / 17."""
+    inner = np.s_[6:-6, 6:-6]
+    _, nothing = detail(speckle(1, 20.0), 400.0)
+    assert nothing[inner].mean() < 0.1
+    _, some = detail(speckle(2, 20.0 * np.sqrt(17.0)), 400.0)
+    assert some[inner].mean() == pytest.approx(16.0 / 17.0, abs=0.02)
+
+
+def test_no_block_changes_it() -> None:
+    image = speckle(3)
+    whole, part = detail(image, 50.0), detail(image[10:50, 12:60], 50.0)
+    for of_all, own in zip(whole, part):
+        assert (own[6:-6, 6:-6] == of_all[16:44, 18:54]).all()

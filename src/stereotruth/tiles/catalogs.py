@@ -1,9 +1,14 @@
-"""The dataset as a STAC collection: an item for each pair, its files as assets.
+"""The dataset as a STAC collection, and as Croissant, by libraries of the extra ``catalog``.
 
-``stac/collection.json``, ``stac/<tile>/<tile>.json``; orientation files and the corrected RPCs of
-the original images are copied to ``stac/orientation/`` and ``stac/rpc/``. Links are relative, so
-that the folder can be moved as a whole. Tiles lie in no map projection: ``proj:code`` is null, and
-``proj:shape``, the footprint and the orientation file say where they are.
+*STAC*: an item for each pair, its files as assets. ``stac/collection.json``,
+``stac/<tile>/<tile>.json``; orientation files and the corrected RPCs of the original images are
+copied to ``stac/orientation/`` and ``stac/rpc/``. Links are relative, so that the folder can be
+moved as a whole. Tiles lie in no map projection: ``proj:code`` is null, and ``proj:shape``, the
+footprint and the orientation file say where they are.
+
+*Croissant*, the vocabulary of data sets for machine learning: ``croissant.json`` has the files'
+sets and the record set ``pairs``: lines of the manifest, with the paths of images and disparities.
+Their pixels are no fields: mlcroissant makes 8 bits of a TIFF's.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import mlcroissant as mlc
 import numpy as np
 import pystac
 from pystac.extensions.file import FileExtension
@@ -26,13 +32,32 @@ from ..core.products.provenance import file_sha256
 from ..core.products.rasters import image_facts
 from ..sensor.rpc import RPC
 from ..sensor.rpc_files import rpc_text
+from .manifest import FOOTPRINTS, NO_TRUTH, TRUTH
 
-FOLDER, COLLECTION = "stac", "stac/collection.json"
+FOLDER = "stac"
 PREFIX = "stereotruth"
 TEXTS = ("tile", "city", "scene", "split", "class", "quality")
 LONG_AGO, EVER = datetime(1970, 1, 1, tzinfo=UTC), datetime(2100, 1, 1, tzinfo=UTC)
 IMAGES = {"left": "left epipolar image", "right": "right epipolar image"}
 TIFF, JSON, TEXT = "image/tiff", "application/json", "text/plain"
+CROISSANT = "croissant.json"
+URL = "https://doi.org/10.1109/TGRS.2023.3245205"
+COLUMNS = {
+    "tile": mlc.DataType.TEXT,
+    "city": mlc.DataType.TEXT,
+    "scene": mlc.DataType.TEXT,
+    "split": mlc.DataType.TEXT,
+    "right_offset_px": mlc.DataType.INTEGER,
+    "labelled_share": mlc.DataType.FLOAT,
+    "left": mlc.DataType.TEXT,
+    "right": mlc.DataType.TEXT,
+    "disp": mlc.DataType.TEXT,
+}
+KINDS = {
+    "left": ("left", "left epipolar image, the reference"),
+    "right": ("right", "right epipolar image"),
+    "disparity": ("disp", "disparity x_left - x_right in px; -999: none"),
+}
 
 
 def _when(text: str, scene: str) -> datetime:
@@ -81,13 +106,12 @@ def write_stac(
         keywords=["satellite stereo", "disparity", "LiDAR"],
         summaries=pystac.Summaries({f"{PREFIX}:split": sorted({row["split"] for row in rows})}),
     )
-    for name in ("manifest.csv", "footprints.geojson"):
-        kind = "text/csv" if name.endswith("csv") else "application/geo+json"
-        collection.add_asset(
-            name.partition(".")[0], pystac.Asset(str(folder / name), None, None, kind)
-        )
+    for name, kind in (("manifest.csv", "text/csv"), (FOOTPRINTS, "application/geo+json")):
+        asset = pystac.Asset(str(folder / name), None, None, kind)
+        collection.add_asset(name.partition(".")[0], asset)
     collection.add_items(items)
     collection.normalize_hrefs(str(root))
+    collection.make_asset_hrefs_relative()
     collection.make_all_asset_hrefs_relative()
     collection.save(catalog_type=pystac.CatalogType.SELF_CONTAINED)
     for row in rows:
@@ -151,3 +175,47 @@ def _raster(
     band = {"nodata": facts.nodata, "data_type": facts.dtype, "unit": unit}
     bands = [RasterBand.create(**band) for _ in range(facts.bands)]
     RasterExtension.ext(asset, add_if_missing=True).apply(bands)
+
+
+def write_croissant(folder: Path) -> None:
+    """Describe the dataset in ``folder``, whose manifest is written."""
+    manifest = mlc.FileObject(
+        id="manifest",
+        name="manifest.csv",
+        content_url="manifest.csv",
+        encoding_formats=["text/csv"],
+        sha256=file_sha256(folder / "manifest.csv"),
+    )
+    files = [
+        mlc.FileSet(
+            id=f"{kind}-files",
+            name=f"{kind}-files",
+            description=meaning,
+            encoding_formats=["image/tiff"],
+            includes=[
+                f"{TRUTH}/*/{place}/*.tiff",
+                *([] if kind == "disparity" else [f"{NO_TRUTH}/{place}/*.tiff"]),
+            ],
+        )
+        for kind, (place, meaning) in KINDS.items()
+    ]
+    fields = [
+        mlc.Field(
+            id=f"pairs/{column}",
+            name=column,
+            data_types=[kind],
+            source=mlc.Source(file_object="manifest", extract=mlc.Extract(column=column)),
+        )
+        for column, kind in COLUMNS.items()
+    ]
+    said = "a pair of images, its labels and files (paths from the folder of this file)"
+    pairs = mlc.RecordSet(id="pairs", name="pairs", description=said, fields=fields)
+    metadata = mlc.Metadata(
+        name="stereotruth",
+        description="Epipolar pairs of satellite images with ground-truth disparity",
+        url=URL,
+        distribution=[manifest, *files],
+        record_sets=[pairs],
+    )
+    text = json.dumps(metadata.to_json(), indent=1, default=str)
+    (folder / CROISSANT).write_text(text + "\n", encoding="utf-8")
