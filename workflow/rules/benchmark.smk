@@ -91,7 +91,7 @@ rule submission:
     params:
         sources=upstream("submission"),
         script=content_of("../scripts/submission.py"),
-        code=source_digest("stereobench.scores.submission"),
+        code=source_digest("stereobench.scores.prediction_files"),
     message:
         "Packing the results of {wildcards.method} on dataset {wildcards.dataset}"
     script:
