@@ -394,19 +394,19 @@ def difference(
     ``better_share``: of the tiles on which the second has the smaller figure.
     """
     tiles = [name for name in first if name in second]
-    found: dict[str, Any] = dict.fromkeys(("", "_low", "_high", "_better_share"))
+    found: dict[str, Any] = dict.fromkeys(("value", "low", "high", "better_share"))
     if tiles:
         sums = np.array([[*first[name], *second[name]] for name in tiles])
 
         def pooled(total: Floats) -> Floats:
             return total[..., 3] / total[..., 2] - total[..., 1] / total[..., 0]
 
-        found[""] = float(pooled(sums.sum(axis=0)))
-        found["_better_share"] = float((pooled(sums) < 0).mean())
+        found["value"] = float(pooled(sums.sum(axis=0)))
+        found["better_share"] = float((pooled(sums) < 0).mean())
         if len(tiles) >= MIN_TILES and times:
             samples = pooled(resampled(sums, times, seed))
-            found["_low"], found["_high"] = np.percentile(samples, CONFIDENCE).tolist()
-    rounded = {end: None if value is None else round(value, 6) for end, value in found.items()}
+            found["low"], found["high"] = np.percentile(samples, CONFIDENCE).tolist()
+    rounded = {name: None if v is None else round(v, 6) for name, v in found.items()}
     return {"tiles": len(tiles), **rounded}
 
 
@@ -438,8 +438,8 @@ def differences(methods: Sequence[Row], folders: Sequence[str | Path], *, seed: 
         row: dict[str, Any] = {"method": methods[b]["label"], "less": methods[a]["label"]}
         for key in names:
             found = difference(sums[a][key], sums[b][key], methods[0]["bootstrap"], seed)
-            row["tiles"] = found.pop("tiles")
-            row |= {f"{key}{end}": value for end, value in found.items()}
+            row |= {"tiles": found["tiles"], key: found["value"]}
+            row |= {f"{key}_{end}": found[end] for end in ("low", "high", "better_share")}
         rows.append(row)
     better = "better on (% of tiles)"
     figures = [

@@ -1,10 +1,13 @@
-"""A method over a dataset: what is kept, what is made again, and what is refused."""
+"""A method over a dataset: what is kept, made again and refused, and what is told of the method."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
+from email.message import Message
+from importlib.metadata import PathDistribution, version
 from pathlib import Path
 
 import cv2
@@ -12,7 +15,7 @@ import numpy as np
 import pytest
 
 from stereobench.scores.prediction_files import read_prediction, read_record, read_uncertainty
-from stereobench.scores.predictions import predict
+from stereobench.scores.predictions import _licence, identity, predict
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import write_table
 from stereotruth.core.products.rasters import read_disparity
@@ -147,17 +150,6 @@ def test_what_a_folder_lacks_is_told(dataset):
         run(dataset, settings | {"polarity": "positive"})
 
 
-def test_images_that_do_not_fit_each_other_are_refused(dataset):
-    write(Path("data/test/right/KM_right_2.tiff"), np.zeros((8, 13), np.uint16))
-    with pytest.raises(InputError, match=r"left image is \(8, 12\) uint16, right one \(8, 13\)"):
-        run(dataset)
-
-
-def test_no_record_is_told(tmp_path):
-    with pytest.raises(InputError, match="no predictions"):
-        read_record(tmp_path)
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the system counts as it does")
 def test_peak_memory_is_that_of_the_process_alone():
@@ -247,3 +239,48 @@ def test_a_folder_of_predictions_of_somebody_else_names_no_other_place(tmp_path,
     (tmp_path / "predictions.json").write_text(text)
     with pytest.raises(InputError, match=r"predictions\.json: (the name of a pair|no record)"):
         read_record(tmp_path)
+
+
+def test_sgm_is_that_of_opencv():
+    found = identity({"kind": "sgm"}, code="abc")
+    assert found["version"].startswith("opencv-python") and found["licence"].startswith("Apache")
+    assert found["code"] == "abc" and found["files"] == {}
+
+
+def test_a_function_is_of_its_distribution(tmp_path):
+    found = identity({"kind": "function", "function": "scipy.ndimage:shift"})
+    assert found["version"] == f"scipy {version('scipy')}" and "BSD" in found["licence"]
+    of_a_file = identity({"kind": "function", "function": "mine.py:f"})
+    assert of_a_file["version"] is of_a_file["licence"] is of_a_file["code"] is None
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("MIT\n", "MIT"),
+        ("\n   Apache License\n  Version 2.0, January 2004\n\nTERMS", "Apache License 2.0"),
+        ("BSD 3-Clause License\n\nCopyright (c) somebody", "BSD 3-Clause License"),
+        ("Copyright (c) somebody\n\nRedistribution and use", None),
+        ("", None),
+    ],
+)
+def test_a_licence_has_the_name_that_its_text_begins_with(tmp_path, monkeypatch, text, name):
+    about = Message()
+    about["Name"], about["License"] = "theirs", text
+    monkeypatch.setattr(PathDistribution, "metadata", about)
+    assert _licence(PathDistribution(tmp_path)) == name
+
+
+@pytest.mark.parametrize("kind", ["command", "stereonet", "sgm", "folder"])
+def test_what_the_entry_says_counts_and_files_have_checksums(tmp_path, kind):
+    for name in ("weights.pt", "code/infer.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    files = [tmp_path / "weights.pt", tmp_path / "code/infer.py"]
+    found = identity({"kind": kind, "licence": "MIT", "version": "2.1"}, files)
+    assert (found["licence"], found["version"]) == ("MIT", "2.1")
+    assert found["files"] == {
+        name: hashlib.sha256(name.encode()).hexdigest() for name in ("weights.pt", "code/infer.py")
+    }
+    other = identity({"kind": kind})
+    assert kind == "sgm" or other["licence"] is other["version"] is None
