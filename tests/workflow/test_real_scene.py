@@ -12,7 +12,7 @@ import yaml
 from figures import evaluate_checkpoints
 from rasterio.windows import Window
 
-from stereotruth.evaluate.scene_warping import warp_scene
+from stereotruth.evaluate.labels_against_images import warp_scene
 
 from ..synthetic.project import ROOT
 

@@ -82,7 +82,7 @@ rule score_dsm:
     params:
         sources=upstream("score_dsm"),
         script=content_of("../scripts/score_dsm.py"),
-        code=source_digest("stereotruth.evaluate.surface_models.page"),
+        code=source_digest("stereotruth.evaluate.surface_models.score"),
         templates=templates_of("stereotruth/evaluate/surface_models/page.html.jinja"),
     message:
         "Judging the surface model of scene {wildcards.scene} by {wildcards.method}"

@@ -8,6 +8,7 @@ scene and tile, and drawn.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,17 +17,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ..core.errors import InputError
 from ..core.numerics.error_sums import ErrorSum
 from ..core.products.files import read_table, write_table
-from ..core.products.grids import require_complete
+from ..core.products.grids import blocks, open_grid, require_complete
 from ..core.products.rasters import read_tile
-from ..epipolar.warping import CorrelationSum
+from ..epipolar.warping import CorrelationSum, agreement, warp_window
 from ..pages import pictures
 from ..tiles.manifest import Tile, read_manifest
 from ..tiles.sift_matches import GROSS_PX
 from ..tiles.tile_classes import BUILDING, VEGETATION
 from ..tiles.warped_tile import warp_tile
-from .scene_warping import SceneWarping, warp_scene
 
 Floats = NDArray[np.float64]
 
@@ -334,3 +335,44 @@ def _draw_warping(path: Path, city: str, tiles: Path, rows: Sequence[Mapping[str
                 figure.colorbar(shown, ax=axis, shrink=0.8)
     figure.suptitle(f"{city}: right image warped to the left, brought to its brightness")
     pictures.save_figure(path, figure, dpi=90)
+
+
+BLOCK = 1024  # px
+
+
+@dataclass
+class SceneWarping:
+    """Sums of left and warped right image, and counts of pixels: labelled, in the left image."""
+
+    sums: CorrelationSum = field(default_factory=CorrelationSum)
+    labelled: int = 0
+    imaged: int = 0
+
+    def merge(self, other: SceneWarping) -> None:
+        """Add those of other pixels."""
+        self.sums.merge(other.sums)
+        self.labelled += other.labelled
+        self.imaged += other.imaged
+
+
+def warp_scene(left: str | Path, right: str | Path, disparity: str | Path) -> SceneWarping:
+    """Warp a scene, given as left.zarr, right.zarr and disparity.zarr, block by block.
+
+    Raises InputError for unfinished stores.
+    """
+    left_image, right_image = (open_grid(path)["image"] for path in (left, right))
+    labels = open_grid(disparity)["disparity"]
+    if not left_image.shape == right_image.shape == labels.shape:
+        raise InputError(
+            "images and disparity differ in size", file=disparity, remedy="run project again"
+        )
+    total = SceneWarping()
+    for rows, cols in blocks(labels.shape, BLOCK):
+        values = labels[rows, cols].values.astype(np.float64)
+        warped = warp_window(right_image, values, rows, cols)
+        reference = left_image[rows, cols].values.astype(np.float64)
+        labelled = int(np.isfinite(values).sum())
+        total.merge(
+            SceneWarping(agreement(reference, warped), labelled, int((reference != 0).sum()))
+        )
+    return total

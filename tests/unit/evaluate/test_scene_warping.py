@@ -7,7 +7,7 @@ from figures import draw_panels
 
 from stereotruth.core.products import grids
 from stereotruth.epipolar import warping
-from stereotruth.evaluate.scene_warping import warp_scene
+from stereotruth.evaluate.labels_against_images import warp_scene
 from stereotruth.tiles import warped_tile
 
 from ...synthetic.truth_scene import write_disparity

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.evaluate.surface_models.height_errors import HeightErrors
+from stereotruth.evaluate.surface_models.score import HeightErrors
 
 
 def test_figures_are_those_of_all_errors():

@@ -11,9 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 from stereotruth.core.errors import InputError
 from stereotruth.evaluate.surface_models import score
-from stereotruth.evaluate.surface_models.height_errors import OPEN, SOLID
 from stereotruth.evaluate.surface_models.reference import RasterReference
-from stereotruth.evaluate.surface_models.score import score_surface_model
+from stereotruth.evaluate.surface_models.score import OPEN, SOLID, score_surface_model
 
 from ....synthetic.analytic_town import (
     CELL_M,
