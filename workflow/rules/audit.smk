@@ -20,7 +20,7 @@ rule audit:
         script=content_of("../scripts/audit.py"),
         dataset=lambda w: dataset_entry(w.dataset),
         settings=SETTINGS.audit.model_dump(),
-        measuring=source_digest("stereobench.audit.pair", "stereobench.audit.matches"),
+        measuring=source_digest("stereobench.audit.pair"),
         code=source_digest("stereobench.audit.audit"),
         templates=templates_of("stereobench/audit/page.html.jinja"),
     message:

@@ -186,16 +186,6 @@ def test_good_pairs_pass_and_nothing_is_measured_twice(tmp_path, monkeypatch):
         assert file.read_bytes() == (tmp_path / "again" / file.name).read_bytes(), file.name
 
 
-def test_pairs_without_labels(tmp_path):
-    scene = make(50, shift=(0.0, 0.6))
-    write(tmp_path / "KM_left_1.tiff", scene.left)
-    write(tmp_path / "KM_right_1.tiff", scene.right)
-    audit.audit(dataset(tmp_path), tmp_path / "out", LIMITS, work=tmp_path / "work")
-    rows, summary = read(tmp_path / "out")
-    assert rows["KM_1"]["verdict"] == FAULT and "vertical parallax" in rows["KM_1"]["faults"]
-    assert summary["labelled_pairs"] == 0
-
-
 def test_files_that_do_not_fit_are_named(tmp_path):
     scene = make(51)
     add(tmp_path, 1, scene, labels=scene.labels[:-5])

@@ -14,9 +14,7 @@ from stereobench.scores.compare_methods import (
     beside_published,
     confidence_chart,
     confidence_table,
-    cumulative_chart,
     read_curves,
-    strata_chart,
 )
 from stereobench.scores.confidence import Confidence
 from stereobench.scores.panels import Column, draw_columns, error_picture
@@ -102,19 +100,6 @@ def test_the_page_opens_with_the_ranking(text, scores):
         for cell, limit in zip(line[3:], ("3", "1")):
             share = 100 * row[f"filled_d1_{limit}_px_share"]
             assert cell.strip("*").startswith(f"{share:.2f}\n[")
-
-
-def test_charts_have_a_line_and_a_point_where_the_files_say(compared):
-    folders = [compared / "benchmark" / name for name in ("two", "half")]
-    methods = [json.loads((folder / "scores.json").read_text()) for folder in folders]
-    lines = re.findall(r"<title>(.*?)</title>", cumulative_chart(methods, folders).svg)
-    assert lines == ["Two", "Half"]
-    said = re.findall(r"<title>(.*?)</title>", strata_chart(methods).svg)
-    assert len(said) == sum(len(of["strata"]) for of in methods)
-    for of in methods:
-        for row in of["strata"]:
-            name = f"{of['label']}, {row['stratum'].replace('_', ' ')}"
-            assert any(f"{name}: {row['filled_epe_px']:.3f}" in text for text in said)
 
 
 def summary(label, factor, count=20_000):

@@ -39,12 +39,8 @@ def test_the_frozen_ones_keep_their_ids():
     "change",
     [
         {"disparity_range": (-128, 65)},
-        {"split": None},
-        {"thresholds_px": (3.0, 1.0)},
         {"truth": "exact"},
         {"grows_with_height": False},
-        {"mask": "all"},
-        {"holes": "left out"},
         {"pooling": "mean of pairs"},
     ],
     ids=lambda change: next(iter(change)),

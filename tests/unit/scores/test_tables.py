@@ -177,22 +177,13 @@ def test_the_interval_covers_a_true_difference() -> None:
     ("settings", "trained_on", "seen"),
     [
         ({"kind": "sgm"}, "nothing", "no"),
-        ({"kind": "pandora"}, "nothing", "no"),
         ({"kind": "pandora", "pipeline": "mccnn"}, "US3D", "yes"),
         ({"kind": "function", "function": "a:b"}, "not stated", "not stated"),
-        ({"kind": "stereonet", "weights": "my.pt"}, "not stated", "not stated"),
         ({"kind": "folder", "trained_on": ["us3d", "whu"]}, "us3d; whu", "yes"),
-        ({"kind": "pandora", "pipeline": "own.json"}, "not stated", "not stated"),
-        ({"kind": "stereonet", "weights": "my.pt", "trained_on": ["whu"]}, "whu", "no"),
         (
             {"kind": "stereonet", "weights": "results/train/us3d/stereonet/best.pt"},
             "us3d, training pairs",
             "training pairs only",
-        ),
-        (
-            {"kind": "stereonet", "weights": "results/train/other/stereonet/best.pt"},
-            "other, training pairs",
-            "no",
         ),
     ],
 )  # fmt: skip
