@@ -25,9 +25,8 @@ Labels = NDArray[np.float32]  # [h, w] px, NaN: none
 
 OFF_ROW_PX = 1.0  # a match that is further off the rows' trend
 GROSS_PX = 3.0  # a match that is further off the labels' bias
+POOR = 0.5  # correlation, less of which counts as such
 EXTRA_PX = 32.0  # disparities are looked for so far beyond the stated range
-QUANTILES = (1, 50, 99)
-SATURATED = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}
 CERTAIN = 0.01  # level at which a convention or an order in depth is taken over
 
 
@@ -58,7 +57,7 @@ def measure(dataset: StereoDataset, pair: Pair) -> dict[str, Any]:
         "same_shape": left.shape == right.shape
         and all(array.shape[:2] == left.shape[:2] for array in arrays),
         "hashes": hashes,
-        "images": {name: _image(array) for name, array in (("left", left), ("right", right))},
+        "grey_values": {"left": np.unique(left).size, "right": np.unique(right).size},
         "identical_images": hashes[0] == hashes[1],
         **of_labels,
     }
@@ -90,8 +89,6 @@ def measure_arrays(
     ``grows``: whether disparities are said to grow with height.
     """
     found: dict[str, Any] = {"matches": len(matches)}
-    if len(matches):
-        found["disparity"] = [float(v) for v in np.percentile(matches.disparity, QUANTILES)]
     found["rows"], trend = _rows(matches, left.shape[:2])
     if labels is None:
         return found
@@ -126,15 +123,6 @@ def _plain(estimate: Estimate) -> list[float | int | None]:
 def _hash(array: NDArray[Any]) -> str:
     head = f"{array.dtype}{array.shape}".encode()
     return hashlib.sha256(head + np.ascontiguousarray(array).tobytes()).hexdigest()
-
-
-def _image(image: NDArray[Any]) -> dict[str, Any]:
-    top = SATURATED.get(image.dtype)
-    return {
-        "zero": float(np.mean(image == 0)),
-        "saturated": 0.0 if top is None else float(np.mean(image == top)),
-        "levels": int(np.unique(image).size),
-    }
 
 
 def _trend(values: Floats, x: Floats, y: Floats, shape: tuple[int, ...]) -> list[Estimate]:
@@ -184,12 +172,10 @@ def _bias(errors: Floats, matches: Matches, shape: tuple[int, ...]) -> tuple[dic
     if not errors.size:
         return {"matches": 0, "bias": _plain(NOTHING)}, 0.0
     trend = _trend(errors, x, y, shape)
-    median = float(np.median(errors))
-    bias = trend[0].value if np.isfinite(trend[0].value) else median
+    bias = trend[0].value if np.isfinite(trend[0].value) else float(np.median(errors))
     return {
         "matches": errors.size,
         **{name: _plain(of) for name, of in zip(("bias", "tilt_x", "tilt_y"), trend)},
-        "median": median,
         "spread": scale_of(errors),
         "gross": float(np.mean(np.abs(errors - bias) > GROSS_PX)),
     }, bias
@@ -209,11 +195,7 @@ def _contradicted(
     return {
         "labels": scan.x.size,
         "share": _plain(scan.contradicted()),
-        "beaten": float(scan.beaten.mean()),
-        "beaten_by_chance": float(scan.beaten_by_chance.mean()),
-        "correlation": float(np.median(scan.here)),
-        "poor": float(np.mean(scan.here < 0.5)),
-        "reach": min(float(high - low) + 8.0, float(label_checks.REACH_PX)),
+        "poor": float(np.mean(scan.here < POOR)),
     }
 
 
@@ -224,16 +206,11 @@ def _hidden(left: Picture, right: Picture, labels: Labels, grows: bool) -> dict[
     nearer = None
     if low > label_checks.IN_FRONT or high < -label_checks.IN_FRONT:
         nearer = LARGER if low > 0 else SMALLER
-    count = max(int(np.isfinite(labels).sum()), 1)
-    shares = {
-        side: float(label_checks.hidden_labels(labels, side).sum() / count)
-        for side in (LARGER, SMALLER)
-    }
+    stated = LARGER if grows else SMALLER
+    hidden = label_checks.hidden_labels(labels, nearer or stated)
     return {
         "nearer": nearer,
-        "evidence": _plain(front),
-        "share": shares[nearer or (LARGER if grows else SMALLER)],
-        "shares": shares,
+        "share": float(hidden.sum() / max(int(np.isfinite(labels).sum()), 1)),
     }
 
 

@@ -31,7 +31,7 @@ EXPLAINS = 0.05  # share of the matches that another meaning of the labels must 
 GAIN = 0.15  # of the squared difference beside steps, by which a move must make it less
 WRONG = 0.25  # share of wrong labels among those of one frequent value
 NEGLIGIBLE = 1e-3  # share of labels outside the range
-MIN_LEVELS = 8  # grey values of an image
+MIN_GREY_VALUES = 8  # of an image
 CHECKS = {  # what a pair must have, in the order of the page
     "files": "files that fit together",
     "rows": "rows that correspond",
@@ -112,8 +112,8 @@ def _files(figures: Figures) -> list[Finding]:
         found.append(Finding("files", FAULT, "images and labels differ in size"))
     if figures["identical_images"]:
         found.append(Finding("files", FAULT, "left and right image are the same"))
-    for side, image in figures["images"].items():
-        if image["levels"] < MIN_LEVELS:
+    for side, count in figures["grey_values"].items():
+        if count < MIN_GREY_VALUES:
             found.append(Finding("files", FAULT, f"the {side} image is empty"))
     if len(set(figures["dtype"])) > 1:
         found.append(Finding("files", NOTE, f"images of types {' and '.join(figures['dtype'])}"))

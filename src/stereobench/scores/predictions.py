@@ -23,7 +23,6 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.metadata import Distribution, distribution, packages_distributions
 from pathlib import Path
 from statistics import median
@@ -51,12 +50,7 @@ from .prediction_files import RECORD, SUBMITTED, UNCERTAINTY, Submission
 MB = 1 << 20
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """One pair: seconds it took (None if it was not run here), peak memory of the process in MB."""
-
-    seconds: float | None
-    memory_mb: float | None
+Took = dict[str, float | None]  # of a pair: seconds (None: not run here), peak memory_mb
 
 
 def predict(
@@ -104,7 +98,7 @@ def predict(
         if piece is None:
             missing.append(pair)
         else:
-            found[pair.name] = Prediction(**piece.result)
+            found[pair.name] = piece.result
     made = progress(maker(missing), len(missing), f"{name}: pairs matched")
     for pair, result in zip(missing, made, strict=True):
         places = _maps(work, pair)
@@ -113,8 +107,11 @@ def predict(
         if result.uncertainty is not None:
             write_disparity(places[UNCERTAINTY], result.uncertainty)
         refuse_replaced(before | seen[pair.name])
-        took = Prediction(result.seconds and round(result.seconds, 6), result.memory_mb)
-        ledger.put(pair.name, keys[pair.name], places, vars(took))
+        took = {
+            "seconds": result.seconds and round(result.seconds, 6),
+            "memory_mb": result.memory_mb,
+        }
+        ledger.put(pair.name, keys[pair.name], places, took)
         found[pair.name] = took
     record = {
         "dataset": dataset.name,
@@ -131,7 +128,7 @@ def predict(
         "threads": workers,
         **_summary(found),
         **({SUBMITTED: maker.submission.scores} if maker.submission else {}),
-        "pairs": {pair.name: vars(found[pair.name]) for pair in pairs},
+        "pairs": {pair.name: found[pair.name] for pair in pairs},
     }
     text = json.dumps(record, indent=2) + "\n"
     with atomic_folder(out) as scratch:
@@ -266,10 +263,10 @@ def _check(result: Matched, pair: Pair, name: str) -> None:
         )
 
 
-def _summary(found: Mapping[str, Prediction]) -> dict[str, float | None]:
+def _summary(found: Mapping[str, Took]) -> dict[str, float | None]:
     """Median time of a pair, with what the middle 95 % of the pairs took; largest memory."""
-    seconds = [of.seconds for of in found.values() if of.seconds is not None]
-    memory = [of.memory_mb for of in found.values() if of.memory_mb is not None]
+    seconds = [of["seconds"] for of in found.values() if of["seconds"] is not None]
+    memory = [of["memory_mb"] for of in found.values() if of["memory_mb"] is not None]
     return {
         "median_seconds": round(median(seconds), 6) if seconds else None,
         "median_seconds_low": round(float(np.quantile(seconds, 0.025)), 6) if seconds else None,

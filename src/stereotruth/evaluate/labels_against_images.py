@@ -197,22 +197,8 @@ def evaluate_city(
     whole = SceneWarping()
     for warped in by_scene.values():
         whole.merge(warped)
-    tile_rows = [
-        dict(
-            zip(
-                WARPING,
-                (
-                    "tile",
-                    row["tile"],
-                    row["class"],
-                    row["labelled_share"],
-                    row["count_labelled"],
-                    row["warp_correlation"],
-                ),
-            )
-        )
-        for row in rows
-    ]
+    columns = ("tile", "class", "labelled_share", "count_labelled", "warp_correlation")
+    tile_rows = [dict(zip(WARPING, ("tile", *(row[name] for name in columns)))) for row in rows]
     scene_rows = [_warping_row("scene", scene, warped) for scene, warped in by_scene.items()]
     write_table(warping, [_warping_row("city", city, whole), *scene_rows, *tile_rows], WARPING)
     _draw_sift(Path(sift_figure), city, by_kind, maps)
@@ -310,23 +296,15 @@ def _draw_warping(path: Path, city: str, tiles: Path, rows: Sequence[Mapping[str
         difference = tile.left - warped
         spread = float(np.nanpercentile(np.abs(difference), 95))
         gray = {"cmap": "gray", "vmin": limits[0], "vmax": limits[1]}
-        for axis, image, title, style in (
-            (line[0], tile.left, f"{tile.name} ({row['class']}): left", gray),
-            (line[1], scaled, "right", gray),
-            (line[2], tile.disparity, "disparity (px)", {"cmap": pictures.DISPARITIES}),
-            (
-                line[3],
-                tile.sums.match(tile.warped),
-                f"warped right, r = {tile.correlation:.3f}",
-                gray,
-            ),
-            (
-                line[4],
-                difference,
-                "left − warped right",
-                {"cmap": pictures.DIFFERENCES, "vmin": -spread, "vmax": spread},
-            ),
-        ):
+        coloured = {"cmap": pictures.DIFFERENCES, "vmin": -spread, "vmax": spread}
+        panels = (
+            (tile.left, f"{tile.name} ({row['class']}): left", gray),
+            (scaled, "right", gray),
+            (tile.disparity, "disparity (px)", {"cmap": pictures.DISPARITIES}),
+            (warped, f"warped right, r = {tile.correlation:.3f}", gray),
+            (difference, "left − warped right", coloured),
+        )
+        for axis, (image, title, style) in zip(line, panels):
             axis.set_facecolor("black" if style is gray else np.array(pictures.NO_VALUE) / 255)
             axis.set(xticks=[], yticks=[])
             shown = axis.imshow(image[::step, ::step], interpolation="nearest", **style)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -114,8 +114,7 @@ class Truth:
         return dict(zip(GROUPS, masks))
 
 
-@dataclass(frozen=True, eq=False)
-class Labels:
+class Labels(NamedTuple):
     """Labels in a window; arrays [h, w].
 
     ``disparity`` and its standard ``uncertainty`` float64 px, NaN where there is none; ``status``
@@ -130,11 +129,8 @@ class Labels:
     def read(cls, store: xr.Dataset, rows: slice, cols: slice) -> Labels:
         """The labels of a disparity store in a window [rows, cols]."""
         window = store.isel(y=rows, x=cols)
-        return cls(
-            window["disparity"].values.astype(np.float64),
-            window["status"].values,
-            window["uncertainty"].values.astype(np.float64),
-        )
+        disparity, status, uncertainty = (window[name].values for name in cls._fields)
+        return cls(disparity.astype(np.float64), status, uncertainty.astype(np.float64))
 
 
 def status_names(store: xr.Dataset) -> tuple[str, ...]:
@@ -361,25 +357,8 @@ def compare_scene(
     return result
 
 
-TABLE = (
-    "scope",
-    "labels",
-    "mean_absolute_px",
-    "median_px",
-    "rms_px",
-    "nmad_px",
-    *(f"share_over_{limit:g}_px" for limit in LIMITS),
-    *SHARES,
-    "y_parallax_rms_px",
-    "y_parallax_mean_px",
-    "y_parallax_max_px",
-    "share_below_1_uncertainty",
-    "share_below_2_uncertainties",
-)
-
-
 def table_row(scope: str, comparison: Comparison) -> dict[str, Any]:
-    """One line of the table: columns of ``TABLE``."""
+    """One line of the table."""
     figures = comparison.figures()
     errors, parallax = figures["errors"], figures["y_parallax"]
     return {
@@ -440,23 +419,22 @@ def evaluate_truth(
                 scene.disparity, scene.truth, scene.tiles, scene=scene.name, workers=workers
             )
         )
-    write_table(csv_file, table(result), TABLE)
+    write_table(csv_file, table(result), list(table_row("", Comparison(("labelled",)))))
     write_json(json_file, result.figures() | {"provenance": dict(provenance or {})})
     shown = result.all_tiles if result.tiles else result.whole
     row = table_row("", shown.total)
+    factors = {
+        "mean_absolute_px": 1,
+        "share_over_1_px": 100,
+        "y_parallax_rms_px": 1,
+        "share_of_visible_labelled": 100,
+        "share_of_hidden_labelled": 100,
+    }
+    values = [np.nan if row[key] is None else row[key] * k for key, k in factors.items()]
     log.info(
         "%s: mean absolute error %.3f px, %.3f %% over 1 px; y-parallax %.3f px rms; %.1f %% of "
         "the visible and %.1f %% of the hidden pixels labelled",
         "tiles" if result.tiles else "scene",
-        *(
-            np.nan if value is None else value * factor
-            for value, factor in (
-                (row["mean_absolute_px"], 1),
-                (row["share_over_1_px"], 100),
-                (row["y_parallax_rms_px"], 1),
-                (row["share_of_visible_labelled"], 100),
-                (row["share_of_hidden_labelled"], 100),
-            )
-        ),
+        *values,
     )
     return result

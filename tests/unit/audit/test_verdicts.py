@@ -61,7 +61,7 @@ def verdict(bias, error, limits):
     figures = {
         "same_shape": True,
         "identical_images": False,
-        "images": {},
+        "grey_values": {},
         "dtype": ["uint16"],
         "matches": 500,
         "rows": {"parallax": plain, "tilt_x": plain, "tilt_y": plain},

@@ -17,8 +17,10 @@ deviation of 1 m has 0.56 and 0. Vertical noise below a tenth of the step has no
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,9 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from ...core.numerics.error_sums import quantile_bin
 from ...lidar.height_raster import Floats
 from .reference import BUILDING, NONE, OTHER, TREE, WATER, Lattice
+
+# All-NaN rows are edges that are dropped: NumPy need not warn of them.
+_quiet = partial(warnings.catch_warnings, action="ignore", category=RuntimeWarning)
 
 LEAST_STEP_M = 3.0  # of a roof's edge over the ground beside it
 REACH_M = 4.0  # of profiles to each side, and of the points that tell the line
@@ -152,13 +157,6 @@ def _lines(lattice: Lattice, i: NDArray, j: NDArray, classified: bool) -> Edges:
             good &= (high & (kind == BUILDING)).sum(axis=1) >= 0.95 * high.sum(axis=1)
     x, y = cx[:, 0] + at * nx, cy[:, 0] + at * ny
     return Edges(*(v[good] for v in (x, y, nx, ny, top, foot)))
-
-
-def _quiet():
-    """All-NaN rows are edges that are dropped: numpy need not warn of them."""
-    import warnings
-
-    return warnings.catch_warnings(action="ignore", category=RuntimeWarning)
 
 
 @dataclass(frozen=True)

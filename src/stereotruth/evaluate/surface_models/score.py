@@ -27,6 +27,7 @@ from ...core.job import progress
 from ...core.numerics import error_sums
 from ...core.numerics.error_sums import ErrorSum
 from ...core.products.files import atomic_folder, write_json, write_table
+from ...core.products.grids import blocks
 from ...lidar.frames import DEFAULT_EPOCHS, Epochs
 from ...lidar.height_raster import Floats, HeightRaster, Window
 from ...pages.figures import AXES, Chart, Plot, styled
@@ -94,14 +95,6 @@ class Verdict:
         }
 
 
-def _windows(shape: tuple[int, int], side: int) -> list[tuple[slice, slice]]:
-    return [
-        (slice(r, min(r + side, shape[0])), slice(c, min(c + side, shape[1])))
-        for r in range(0, shape[0], side)
-        for c in range(0, shape[1], side)
-    ]
-
-
 def _read(model: HeightRaster, rows: slice, cols: slice, margin_m: float) -> Window:
     """The model's heights in a window and around it."""
     more = [int(np.ceil(margin_m / step)) + 2 for step in model.cell_m[::-1]]
@@ -112,7 +105,7 @@ def _read(model: HeightRaster, rows: slice, cols: slice, margin_m: float) -> Win
 def _parts(model: HeightRaster, reference: Reference, step_m: float) -> Iterator[tuple[Part, int]]:
     """Windows of the model with the reference's solid points, spread over it, and their groups."""
     side = int(np.clip(np.sqrt(model.shape[0] * model.shape[1] / PARTS), 24, BLOCK))
-    windows = _windows(model.shape, side)
+    windows = blocks(model.shape, side)
     rng = np.random.default_rng(0)
     if len(windows) > 2 * PARTS:
         windows = [windows[k] for k in sorted(rng.choice(len(windows), PARTS, replace=False))]
@@ -165,7 +158,7 @@ def score_surface_model(
     margin = REACH_M + abs(found.east_m) + abs(found.north_m)
     along, across = np.linalg.solve(model.to_enu, [found.east_m, found.north_m])
 
-    windows = _windows(model.shape, BLOCK)
+    windows = blocks(model.shape, BLOCK)
     for window in progress(windows, len(windows), "surface model judged"):
         lattice = lattice_of(reference, model, *window, step_m, AROUND_M)
         heights = _read(model, *window, margin + 4.0)
