@@ -8,7 +8,7 @@ import pytest
 from stereobench.audit import label_checks
 from stereobench.audit.matches import grey, match_pair, smooth
 
-from ...synthetic.pair_with_block import BLOCK, HEIGHT_PX, make
+from ...synthetic.pair_with_block import make
 
 
 def smoothed(scene):
@@ -67,17 +67,6 @@ def test_right_labels_are_not_contradicted_wrong_ones_are():
     assert scan.beaten[inside].mean() > 0.8
     assert scan.beaten[~inside].mean() < 0.03
     assert scan.contradicted().value > 0.4 * inside.mean()
-
-
-def test_a_removed_block_is_contradicted():
-    scene = make(10)
-    labels = scene.labels.copy()
-    first, last, top, bottom = BLOCK
-    labels[top:bottom, first:last] -= np.float32(HEIGHT_PX)
-    scan = label_checks.scan_labels(*smoothed(scene), labels, (-20.0, 30.0))
-    inside = (scan.x >= first) & (scan.x < last) & (scan.y >= top) & (scan.y < bottom)
-    assert scan.beaten[inside].mean() > 0.7
-    assert scan.beaten[~inside].mean() < 0.01
 
 
 def test_noise_contradicts_nothing():

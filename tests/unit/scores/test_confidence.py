@@ -67,11 +67,6 @@ def test_normal_errors_of_stated_spread_lie_in_their_intervals(rng):
     json.dumps(found)
 
 
-def test_tiles_pool(rng):
-    error, sigma = rng.normal(0, 1, 1000), rng.uniform(0.5, 2, 1000)
-    assert confidence(error, sigma, parts=7).figures() == confidence(error, sigma).figures()
-
-
 def test_pixels_that_lack_something_do_not_count():
     found = Confidence()
     assert found.figures() == {"pixels": 0}

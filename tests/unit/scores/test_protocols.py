@@ -91,16 +91,3 @@ def test_tables_show_one_id_and_refuse_two(compared, tmp_path):
     with pytest.raises(InputError, match=rf"several protocols .*Two: {protocol}; Half: own-"):
         compare(dataset, "test", folders, predictions, tmp_path / "out", seed=1)
     assert one_id([]) == ""
-
-
-def test_the_exact_truth_is_asked_for(compared, tmp_path):
-    dataset = StereoDataset("toy", compared / "data", "whu", (-64, 128))
-    with pytest.raises(InputError, match=r"KM_1 has no exact truth"):
-        score(
-            dataset,
-            "test",
-            "Two",
-            compared / "match/two",
-            tmp_path / "out",
-            replace(PLAN, protocol="exact-2026"),
-        )

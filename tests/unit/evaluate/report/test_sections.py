@@ -59,15 +59,6 @@ def test_what_the_images_say_is_one_number_on_the_page_and_in_the_terminal():
     assert "1315 matches" in found["SIFT disparity − label"].note
 
 
-def test_several_scenes_have_their_range():
-    other = SCENE | {"sift_mean_absolute_error_px": 0.31, "sift_matches": 85}
-    card = cards({"A-1": SCENE, "A-2": other}, height=2.0)["SIFT disparity − label"]
-    assert card.value == "0.24–0.31 px"
-    assert card.note == (
-        "2 scenes; 1400 matches, mean absolute; about 0.18 px of it SIFT's own; ≤ 0.62 m of height"
-    )
-
-
 def test_how_well_labels_are_known_comes_first_with_the_surfaces():
     by = {
         "all": {"uncertainty_median_px": 0.0412, "uncertainty_p95_px": 0.104},
