@@ -352,20 +352,10 @@ def _distributions(settings: Mapping[str, Any]) -> list[Distribution]:
 
 
 def _licence(found: Distribution) -> str | None:
+    """Its name, where the distribution states it in a line or by a classifier."""
     about = found.metadata
-    stated = [about.get(key) or "" for key in ("License-Expression", "License")]
-    named = [
-        c.rpartition(" :: ")[2] for c in about.get_all("Classifier") or () if "License ::" in c
-    ]
-    names = [text.strip() for text in stated if "\n" not in text.strip()]
-    titles = [_title(text) for text in stated]  # some put the whole text there
-    return next(filter(None, [*names, *named, *titles]), LICENCES.get(found.name))
-
-
-def _title(text: str) -> str:
-    """Name of a licence, where its text begins with that."""
-    first, second, *_ = [*(line.strip() for line in text.splitlines() if line.strip()), "", ""]
-    if "license" not in first.casefold():
-        return ""
-    version = re.match(r"Version ([\d.]+)", second)
-    return f"{first} {version[1]}" if version else first
+    stated = [(about.get(key) or "").strip() for key in ("License-Expression", "License")]
+    classes = [c for c in about.get_all("Classifier") or () if "License ::" in c]
+    named = [text for text in stated if text and "\n" not in text]
+    named += [text.rpartition(" :: ")[2] for text in classes]
+    return next(iter(named), LICENCES.get(found.name))

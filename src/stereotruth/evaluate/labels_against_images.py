@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.stats import binned_statistic_2d
 
 from ..core.errors import InputError
 from ..core.numerics.error_sums import ErrorSum
@@ -220,19 +221,14 @@ class _Map:
 
     def medians(self) -> tuple[Floats, Floats]:
         """Median error and y-parallax (px) in cells of ``CELL_PX``, NaN for a few matches."""
-        cells = tuple(-(-size // CELL_PX) for size in self.shape)
-        x, y, *values = np.hstack([np.empty((4, 0), np.float32), *self.parts])
-        cell = (y // CELL_PX).astype(np.intp) * cells[1] + (x // CELL_PX).astype(np.intp)
-        order = np.argsort(cell, kind="stable")
-        numbers, first = np.unique(cell[order], return_index=True)
-        maps = []
-        for value in values:
-            grid = np.full(cells[0] * cells[1], np.nan)
-            for number, part in zip(numbers, np.split(value[order], first[1:])):
-                if part.size >= CELL_MATCHES:
-                    grid[number] = np.median(part)
-            maps.append(grid.reshape(cells))
-        return maps[0], maps[1]
+        edges = [np.arange(-(-size // CELL_PX) + 1) * CELL_PX for size in self.shape]
+        if not self.parts:
+            error, y_parallax = np.full((2, *(of.size - 1 for of in edges)), np.nan)
+            return error, y_parallax
+        x, y, *values = np.hstack(self.parts)
+        few = np.histogram2d(y, x, edges)[0] < CELL_MATCHES
+        error, y_parallax = binned_statistic_2d(y, x, values, "median", edges).statistic
+        return np.where(few, np.nan, error), np.where(few, np.nan, y_parallax)
 
 
 def _draw_sift(

@@ -171,19 +171,3 @@ def test_missing_and_unlike_stores_are_refused(scene, tmp_path):
     store = write_disparity(other, tmp_path / "moved.zarr", perfect_labels(scene))
     with pytest.raises(InputError, match="another epipolar model"):
         labels_against_truth.compare_scene(store, scene.truth, None, scene="S-1")
-
-
-def test_scenes_with_and_without_masks_are_added_up() -> None:
-    """Those with masks have one status more; other names are other figures."""
-    Comparison = labels_against_truth.Comparison
-    names = "no_points", "labelled"
-    few, more = Comparison(names), Comparison((*names, "masked"))
-    few.counts[:], more.counts[:] = 1, 10
-    for a, b in ((few, more), (more, few)):
-        total = Comparison(a.statuses)
-        total.merge(a)
-        total.merge(b)
-        assert total.statuses == more.statuses
-        assert (total.counts == [11, 11, 10]).all()
-    with pytest.raises(ValueError, match="statuses"):
-        few.merge(Comparison(("labelled", "no_points")))

@@ -44,7 +44,7 @@ def folder(tmp_path):
     put(tmp_path / "tiles/A b/export.json", json.dumps(EXPORT))
     put(tmp_path / "tiles/A b/manifest.csv", "tile\n")
     truth = SceneComparison("A b")
-    truth.all_tiles.parts["ground"] = Comparison(("no_points", "labelled"))
+    truth.all_tiles.parts["ground"] = Comparison()
     truth.all_tiles.parts["ground"].errors.add(np.array([0.0114, -0.0314]))
     put(tmp_path / "results/evaluate/A b/truth.json", json.dumps(truth.figures()))
     for name, epe in (("sgm", 1.25), ("net", 0.5)):
