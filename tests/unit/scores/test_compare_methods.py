@@ -12,10 +12,15 @@ import pytest
 from stereobench.scores import panels
 from stereobench.scores.compare_methods import (
     beside_published,
+    confidence_chart,
     confidence_table,
+    cumulative_chart,
+    read_curves,
+    strata_chart,
 )
 from stereobench.scores.confidence import Confidence
 from stereobench.scores.panels import Column, draw_columns, error_picture
+from stereotruth.core.products.files import write_table
 
 from ...browser import look, needs_chromium
 from ...synthetic.toy_benchmark import texts
@@ -166,3 +171,31 @@ def test_published_rows_say_where_they_stand_and_what_is_not_known():
     assert "whu-2023-12345678" in table.shown[0][0]
     nothing = beside_published([own | {"protocol": {"name": "own", "id": "own-1"}}])
     assert nothing.rows == [] and "Nothing is published" in nothing.shown[0][0]
+
+
+def test_the_curves_are_drawn(tmp_path):
+    one, found = summary("Calibrated", 1)
+    curves = [
+        {"stratum": "all", "removed_share": k / 100, "epe_px": a, "oracle_epe_px": b}
+        for k, (a, b) in enumerate(zip(*found.curves()))
+    ]
+    write_table(tmp_path / "sparsification.csv", curves)
+    (share, stated, oracle) = read_curves(tmp_path)["all"]
+    assert share == pytest.approx(np.arange(100)) and len(stated) == 100
+    assert stated == pytest.approx(found.curves()[0]) and oracle == pytest.approx(found.curves()[1])
+    chart = confidence_chart([one], [tmp_path])
+    assert re.findall("<title>(.*?)</title>", chart.svg) == ["Calibrated"]
+    assert confidence_chart([{"label": "Silent", "confidence": []}], [tmp_path]) is None
+
+
+def test_charts_have_a_line_and_a_point_where_the_files_say(compared):
+    folders = [compared / "benchmark" / name for name in ("two", "half")]
+    methods = [json.loads((folder / "scores.json").read_text()) for folder in folders]
+    lines = re.findall(r"<title>(.*?)</title>", cumulative_chart(methods, folders).svg)
+    assert lines == ["Two", "Half"]
+    said = re.findall(r"<title>(.*?)</title>", strata_chart(methods).svg)
+    assert len(said) == sum(len(of["strata"]) for of in methods)
+    for of in methods:
+        for row in of["strata"]:
+            name = f"{of['label']}, {row['stratum'].replace('_', ' ')}"
+            assert any(f"{name}: {row['filled_epe_px']:.3f}" in text for text in said)
