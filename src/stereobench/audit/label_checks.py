@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -137,13 +136,8 @@ def wrong_at(labels: Labels, value: float, bias: float, matches: Matches) -> Est
 
 def swapped(matches: Matches) -> Matches:
     """The matches seen from the right image, at its nearest pixels."""
-    return replace(
-        matches,
-        x=np.floor(matches.x_right + 0.5),
-        y=np.floor(matches.y + matches.parallax + 0.5),
-        disparity=-matches.disparity,
-        parallax=-matches.parallax,
-    )
+    x, y = matches.x_right, matches.y + matches.parallax
+    return Matches(np.floor(x + 0.5), np.floor(y + 0.5), -matches.disparity, -matches.parallax)
 
 
 # ------------------------------------------------------------------------------- contradiction

@@ -19,9 +19,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import combinations, pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -60,29 +60,16 @@ ROW_STEPS = 4
 FEW = 30  # key points matched: fewer, and other rows are tried
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(NamedTuple):
     """n matches; all in px. ``x``, ``y``: pixels of the left image (whole numbers).
 
-    ``disparity`` x_left − x_right there, ``slope_x``, ``slope_y`` its change per px, ``parallax``
-    y_right − y_left, ``sigma`` of the disparity by the residuals, ``correlation`` of the windows.
+    ``disparity`` x_left − x_right there, ``parallax`` y_right − y_left.
     """
 
     x: Floats
     y: Floats
     disparity: Floats
-    slope_x: Floats
-    slope_y: Floats
     parallax: Floats
-    sigma: Floats
-    correlation: Floats
-
-    def __len__(self) -> int:
-        return self.x.size
-
-    def take(self, chosen: NDArray[Any]) -> Matches:
-        """Those of an index or a mask."""
-        return Matches(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
     @property
     def x_right(self) -> Floats:
@@ -266,10 +253,9 @@ def least_squares(left: Picture, right: Picture, start: Floats) -> Matches:
     Those that do not converge near their start, or fit poorly, are left out.
     """
     out = _matched((left, right), np.zeros_like(left), start, 4, MOVE_PX)
-    d, parallax, along, down, sigma, correlation = out.T
-    found = Matches(start[:, 0], start[:, 1], d, along, down, parallax, sigma, correlation)
     with np.errstate(invalid="ignore"):
-        return found.take((correlation >= MIN_CORRELATION) & (sigma <= POOR_SIGMA))
+        good = (out[:, 5] >= MIN_CORRELATION) & (out[:, 4] <= POOR_SIGMA)
+    return Matches(*start[good, :2].T, *out[good, :2].T)
 
 
 def label_offsets(left: Picture, right: Picture, labels: NDArray[Any], matches: Matches) -> Floats:
@@ -279,7 +265,7 @@ def label_offsets(left: Picture, right: Picture, labels: NDArray[Any], matches: 
     than the label in its middle (0.5 px in a forest, with labels that are right to 0.03 px). So the
     window is matched once more, from where the match has it, in the shape that the labels give it.
     """
-    start = np.column_stack([matches.x, matches.y, matches.disparity, matches.parallax])
+    start = np.column_stack(matches)
     shape = np.ascontiguousarray(labels, np.float32)
     out = _matched((left, right), shape, start, 2, LABEL_MOVE_PX)
     with np.errstate(invalid="ignore"):

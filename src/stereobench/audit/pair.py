@@ -88,7 +88,7 @@ def measure_arrays(
     ``matches`` of the two images; ``spikes``: values of labels that are suspiciously frequent;
     ``grows``: whether disparities are said to grow with height.
     """
-    found: dict[str, Any] = {"matches": len(matches)}
+    found: dict[str, Any] = {"matches": matches.x.size}
     found["rows"], trend = _rows(matches, left.shape[:2])
     if labels is None:
         return found

@@ -129,21 +129,11 @@ def table4_row(name: str, tiles: Sequence[Floats]) -> dict[str, Any]:
     return dict(zip(TABLE4, values))
 
 
-def _sift_row(scope: str, name: str, pairs: int, errors: ErrorSum) -> dict[str, Any]:
-    f = errors.figures()
-    keys = ("count", "bias", "mean_absolute", "median", "rms", "nmad")
-    return dict(zip(SIFT, (scope, name, pairs, *(f[key] for key in keys))))
-
-
-def _correlation(sums: CorrelationSum) -> float | str:
-    value = sums.coefficient
-    return round(value, 6) if np.isfinite(value) else ""
-
-
 def _warping_row(scope: str, name: str, warped: SceneWarping) -> dict[str, Any]:
     share = round(warped.labelled / max(warped.imaged, 1), 6)
-    values = (scope, name, "", share, warped.sums.count, _correlation(warped.sums))
-    return dict(zip(WARPING, values))
+    coefficient = warped.sums.coefficient
+    correlation = round(coefficient, 6) if np.isfinite(coefficient) else ""
+    return dict(zip(WARPING, (scope, name, "", share, warped.sums.count, correlation)))
 
 
 def evaluate_city(
@@ -186,14 +176,13 @@ def evaluate_city(
     order = ("city", "tiles of class", "key points on", "scene", "tile")
     table = [table4_row(f"{city} ({kind})", errors) for kind, errors in by_kind.items() if errors]
     write_table(table4, table, TABLE4)
-    write_table(
-        sift,
-        [
-            _sift_row(*key, pairs[key], sums[key])
-            for key in sorted(sums, key=lambda key: order.index(key[0]))
-        ],
-        SIFT,
-    )
+    sift_rows = []
+    for scope, name in sorted(sums, key=lambda key: order.index(key[0])):
+        of = sums[scope, name].figures()
+        keys = ("count", "bias", "mean_absolute", "median", "rms", "nmad")
+        values = (scope, name, pairs[scope, name], *(of[key] for key in keys))
+        sift_rows.append(dict(zip(SIFT, values)))
+    write_table(sift, sift_rows, SIFT)
     by_scene = {scene: warp_scene(*stores) for scene, stores in scenes.items()}
     whole = SceneWarping()
     for warped in by_scene.values():

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import rasterio
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from ...core.products.rasters import read_flags, read_image, read_tile
@@ -71,7 +72,7 @@ def tile_map(
         x, y = placed[row["tile"]] - west_south[:, None]
         complete, bad = row["complete"] == "yes", bool(missed(row))
         colour = SPLIT_COLOURS.get(row["split"], SPLIT_COLOURS["none"]) if complete else AXES
-        (shape,) = plot.axis.fill(x, y, facecolor=(*_rgb(colour), 0.25 if complete else 0.0))
+        (shape,) = plot.axis.fill(x, y, facecolor=(*to_rgb(colour), 0.25 if complete else 0.0))
         shape.set(edgecolor="#c0280c" if bad else colour, linewidth=2.5 if bad else 1.5)
         shape.set_linestyle(":" if bad else "-" if complete else "--")
         text = f"{row['tile']}: {row['split']}" + (", misses a limit of quality" if bad else "")
@@ -85,10 +86,6 @@ def tile_map(
     plot.axis.set(xlim=(0, east), ylim=(0, north))
     on_the_ground(plot.axis)
     return plot.chart([{k: row[k] for k in ("tile", "scene", "split", "complete")} for row in rows])
-
-
-def _rgb(colour: str) -> tuple[float, ...]:
-    return tuple(value / 255 for value in bytes.fromhex(colour[1:]))
 
 
 def _crs(looks: Sequence[Path], rings: Iterable[np.ndarray]) -> pyproj.CRS:

@@ -174,18 +174,17 @@ def _pairs(rows: Rows, labelled: Rows) -> Headline:
     return Headline("labelled pairs", str(len(labelled)), note)
 
 
-def _is_told(doubt: Mapping[str, Any]) -> bool:
-    """Whether alignment or LiDAR doubt labels by more than these state."""
-    return doubt.get("of") in (ALIGNMENT, LIDAR) and not doubt["explained_by_alignment"]
-
-
 def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     bad = sum(bool(missed(row)) for row in labelled)
     scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
     note = f"and {', '.join(scenes)} as a whole" if scenes else ""
     doubts = quality.get("doubts", {})
     doubted = [s for s, of in doubts.items() if any(d.get("of") not in ABOUT for d in of)]
-    told = [s for s, of in doubts.items() if any(map(_is_told, of))]
+    told = [  # where alignment or LiDAR doubt labels by more than these state
+        scene
+        for scene, of in doubts.items()
+        if any(d.get("of") in (ALIGNMENT, LIDAR) and not d["explained_by_alignment"] for d in of)
+    ]
     if doubted:
         note = joined(note, f"images and labels disagree in {', '.join(doubted)}")
     if told:
