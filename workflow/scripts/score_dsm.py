@@ -3,9 +3,8 @@
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 from stereotruth.evaluate.report.index_page import write_index
-from stereotruth.evaluate.surface_models.score import write_verdict
 from stereotruth.evaluate.surface_models.reference import LidarReference
-from stereotruth.evaluate.surface_models.score import score_surface_model
+from stereotruth.evaluate.surface_models.score import score_surface_model, write_verdict
 from stereotruth.pages.page import INDEX
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from ..tiles.warped_tile import warp_tile
 Floats = NDArray[np.float64]
 
 
+BLOCK = 1024  # px of a grid, that are read at once
 CELL_PX = 128  # of the maps of errors
 CELL_MATCHES = 3  # fewer give no median
 EXAMPLES = 3  # tiles in the figure of warped images
@@ -101,6 +102,44 @@ def read_matches(path: str | Path, tiles: Iterable[Tile]) -> Iterator[Matches]:
             y=column["y"] + row0,
             surface_class=column["surface_class"].astype(np.uint8),
         )
+
+
+@dataclass
+class SceneWarping:
+    """Sums of left and warped right image, and counts of pixels: labelled, in the left image."""
+
+    sums: CorrelationSum = field(default_factory=CorrelationSum)
+    labelled: int = 0
+    imaged: int = 0
+
+    def merge(self, other: SceneWarping) -> None:
+        """Add those of other pixels."""
+        self.sums.merge(other.sums)
+        self.labelled += other.labelled
+        self.imaged += other.imaged
+
+
+def warp_scene(left: str | Path, right: str | Path, disparity: str | Path) -> SceneWarping:
+    """Warp a scene, given as left.zarr, right.zarr and disparity.zarr, block by block.
+
+    Raises InputError for unfinished stores.
+    """
+    left_image, right_image = (open_grid(path)["image"] for path in (left, right))
+    labels = open_grid(disparity)["disparity"]
+    if not left_image.shape == right_image.shape == labels.shape:
+        raise InputError(
+            "images and disparity differ in size", file=disparity, remedy="run project again"
+        )
+    total = SceneWarping()
+    for rows, cols in blocks(labels.shape, BLOCK):
+        values = labels[rows, cols].values.astype(np.float64)
+        warped = warp_window(right_image, values, rows, cols)
+        reference = left_image[rows, cols].values.astype(np.float64)
+        labelled = int(np.isfinite(values).sum())
+        total.merge(
+            SceneWarping(agreement(reference, warped), labelled, int((reference != 0).sum()))
+        )
+    return total
 
 
 def _mean(values: Sequence[float]) -> float | str:
@@ -298,44 +337,3 @@ def _draw_warping(path: Path, city: str, tiles: Path, rows: Sequence[Mapping[str
                 figure.colorbar(shown, ax=axis, shrink=0.8)
     figure.suptitle(f"{city}: right image warped to the left, brought to its brightness")
     pictures.save_figure(path, figure, dpi=90)
-
-
-BLOCK = 1024  # px
-
-
-@dataclass
-class SceneWarping:
-    """Sums of left and warped right image, and counts of pixels: labelled, in the left image."""
-
-    sums: CorrelationSum = field(default_factory=CorrelationSum)
-    labelled: int = 0
-    imaged: int = 0
-
-    def merge(self, other: SceneWarping) -> None:
-        """Add those of other pixels."""
-        self.sums.merge(other.sums)
-        self.labelled += other.labelled
-        self.imaged += other.imaged
-
-
-def warp_scene(left: str | Path, right: str | Path, disparity: str | Path) -> SceneWarping:
-    """Warp a scene, given as left.zarr, right.zarr and disparity.zarr, block by block.
-
-    Raises InputError for unfinished stores.
-    """
-    left_image, right_image = (open_grid(path)["image"] for path in (left, right))
-    labels = open_grid(disparity)["disparity"]
-    if not left_image.shape == right_image.shape == labels.shape:
-        raise InputError(
-            "images and disparity differ in size", file=disparity, remedy="run project again"
-        )
-    total = SceneWarping()
-    for rows, cols in blocks(labels.shape, BLOCK):
-        values = labels[rows, cols].values.astype(np.float64)
-        warped = warp_window(right_image, values, rows, cols)
-        reference = left_image[rows, cols].values.astype(np.float64)
-        labelled = int(np.isfinite(values).sum())
-        total.merge(
-            SceneWarping(agreement(reference, warped), labelled, int((reference != 0).sum()))
-        )
-    return total
