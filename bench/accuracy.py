@@ -34,7 +34,7 @@ from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.evaluate import labels_against_truth
 from stereotruth.evaluate.epipolar_truth import write_grid_truth
-from stereotruth.evaluate.scene_warping import warp_scene
+from stereotruth.evaluate.labels_against_images import warp_scene
 from stereotruth.project.project import read_mapping
 from stereotruth.tiles.manifest import labelled_tiles
 from stereotruth.tiles.tile_checks import warp_tile

@@ -37,7 +37,7 @@ from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.intersection import intersect
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.warping import warp_rows
-from stereotruth.evaluate.scene_warping import warp_scene
+from stereotruth.evaluate.labels_against_images import warp_scene
 from stereotruth.labels.recipe import lidar_labels
 from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.labels.window_points import read_window

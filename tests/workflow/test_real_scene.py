@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from figures import evaluate_checkpoints
 
-from stereotruth.evaluate.scene_warping import warp_scene
+from stereotruth.evaluate.labels_against_images import warp_scene
 
 from ..synthetic.project import ROOT
 

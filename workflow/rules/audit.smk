@@ -17,7 +17,7 @@ rule audit:
         sources=upstream("audit"),
         dataset=lambda w: dataset_entry(w.dataset),
         settings=SETTINGS.audit.model_dump(),
-        measuring=source_digest("stereobench.audit.pair", "stereobench.audit.sharing"),
+        measuring=source_digest("stereobench.audit.pair"),
         code=source_digest("stereobench.audit.audit"),
         templates=templates_of("stereobench/audit/page.html.jinja"),
     message:

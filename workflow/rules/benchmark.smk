@@ -81,7 +81,7 @@ rule submission:
         runtime=30,
     params:
         sources=upstream("submission"),
-        code=source_digest("stereobench.scores.submission"),
+        code=source_digest("stereobench.scores.prediction_files"),
     message:
         "Packing the results of {wildcards.method} on dataset {wildcards.dataset}"
     script:

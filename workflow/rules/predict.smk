@@ -70,7 +70,7 @@ rule score_dsm:
         runtime=240,
     params:
         sources=upstream("score_dsm"),
-        code=source_digest("stereotruth.evaluate.surface_models.page"),
+        code=source_digest("stereotruth.evaluate.surface_models.score"),
         templates=templates_of("stereotruth/evaluate/surface_models/page.html.jinja"),
     message:
         "Judging the surface model of scene {wildcards.scene} by {wildcards.method}"

@@ -2,9 +2,8 @@
 
 from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.report.index_page import write_index
-from stereotruth.evaluate.surface_models.page import write_verdict
 from stereotruth.evaluate.surface_models.reference import LidarReference
-from stereotruth.evaluate.surface_models.score import score_surface_model
+from stereotruth.evaluate.surface_models.score import score_surface_model, write_verdict
 from stereotruth.pages.page import INDEX
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The results of a stereo method, packed to be scored elsewhere."""
 
-from stereobench.scores.submission import pack
+from stereobench.scores.prediction_files import pack
 from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":

@@ -6,9 +6,6 @@
 ``README.txt``        the same in words
 ``index.html``        the page: pooled figures, the worst pairs in pictures, all pairs
 ====================  =============================================================================
-
-Pairs are measured one by one; what was measured stays in a work folder, with a record of the files
-that it was measured from, so that a later call takes over what it would measure the same.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from stereotruth.core.config.methods import Audit, AuditLimits
+from stereotruth.core.config.methods import Audit
 from stereotruth.core.job import progress
 from stereotruth.core.products.files import atomic_file, atomic_folder, write_table
 from stereotruth.core.products.making import marks, refuse_replaced
@@ -35,11 +32,10 @@ from stereotruth.pages.page import way
 from stereotruth.tiles.manifest import SPLITS
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
+from .matches import Features, Shared, features, find_shared
 from .page import write_audit
 from .pair import measure
-from .sharing import Features, Shared, features, find_shared
-from .summary import Audited, in_words, summarise, table_rows
-from .verdicts import FAULT, NOTE, Finding, judge
+from .verdicts import FAULT, NOTE, Audited, Finding, judge, readme, summarise, table_rows
 
 log = logging.getLogger("stereotruth")
 
@@ -56,26 +52,30 @@ def audit(
 ) -> dict[str, Any]:
     """Audit all pairs of a dataset into the folder ``out``; returns the summary.
 
-    ``work``: where what was measured of each pair stays, for runs after a kill, with other limits
-    or with more pairs; ``index``: the page of all pages, for a link.
+    ``work``: what was measured of each pair stays there, with a record of the files that it was
+    measured from and of the ``code``, for runs after a kill, with other limits or with more pairs;
+    ``index``: the page of all pages, for a link.
 
     Raises InputError if the dataset has no pairs or a file cannot be read.
     """
-    out, work, limits = Path(out), Path(work), settings
+    out, work = Path(out), Path(work)
     pairs = dataset.pairs()
     measured = _measure_all(dataset, pairs, work, workers, code)
     log.info("looking for shared ground")
-    looks = [_load_features(work / f"{pair.name}.npz") for pair in pairs]
-    shared = find_shared(looks)
-    audited = decide(pairs, measured, shared, limits)
-    summary = summarise(dataset, audited, shared, limits)
+    shared = find_shared([_load_features(work / f"{pair.name}.npz") for pair in pairs])
+    common = _sharing(pairs, measured, shared)
+    audited = [
+        Audited(pair, figures, [*judge(figures, settings, len(pairs)), *common[k]])
+        for k, (pair, figures) in enumerate(zip(pairs, measured))
+    ]
+    summary = summarise(dataset, audited, shared, settings)
     text = json.dumps(summary, indent=2) + "\n"
     with atomic_folder(out) as scratch:
         write_table(scratch / "pairs.csv", table_rows(audited))
         (scratch / "summary.json").write_text(text, encoding="utf-8")
-        (scratch / "README.txt").write_text(in_words(summary), encoding="utf-8")
+        (scratch / "README.txt").write_text(readme(summary), encoding="utf-8")
         page, to_index = scratch / "index.html", way(out / "index.html", index)
-        write_audit(page, dataset, audited, summary, limits, settings.worst, index=to_index)
+        write_audit(page, dataset, audited, summary, settings, index=to_index)
     for line in summary["statements"]:
         log.info("%s", line)
     return summary
@@ -119,23 +119,10 @@ def _load_features(path: Path) -> Features:
         return Features(stored["place"], stored["vector"], tuple(int(n) for n in stored["shape"]))
 
 
-def decide(
-    pairs: Sequence[Pair],
-    measured: Sequence[Mapping[str, Any]],
-    shared: Sequence[Shared],
-    limits: AuditLimits,
-) -> list[Audited]:
-    """The verdicts on all pairs."""
-    common = _sharing(pairs, measured, shared)
-    return [
-        Audited(pair, figures, judge(figures, limits, len(pairs), common[k]))
-        for k, (pair, figures) in enumerate(zip(pairs, measured))
-    ]
-
-
 def _sharing(
     pairs: Sequence[Pair], measured: Sequence[Mapping[str, Any]], shared: Sequence[Shared]
 ) -> dict[int, list[Finding]]:
+    """Findings by the number of a pair: ground that it shares with others."""
     found: dict[int, list[Finding]] = defaultdict(list)
     for common in shared:
         for me, other in ((common.first, common.second), (common.second, common.first)):

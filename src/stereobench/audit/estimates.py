@@ -106,9 +106,9 @@ def location(values: Floats, groups: NDArray[np.int64]) -> Estimate:
     return robust_fit(np.ones((values.size, 1)), values, groups)[0]
 
 
-def share(hits: NDArray[np.bool_], groups: NDArray[np.int64]) -> Estimate:
-    """Share of hits among [n] samples in cells [n] (ratio estimate, variance between cells)."""
-    return ratio(hits.astype(np.float64), np.ones(hits.size), groups)
+def share(hits: Floats, groups: NDArray[np.int64]) -> Estimate:
+    """Mean of ``hits`` (0 or 1; or a difference of two such) of [n] samples in cells [n]."""
+    return ratio(hits, np.ones(hits.size), groups)
 
 
 def ratio(part: Floats, whole: Floats, groups: NDArray[np.int64]) -> Estimate:

@@ -1,6 +1,6 @@
-"""Sub-pixel matches of a pair that know nothing of its labels.
+"""Matches of images: of a pair to sub-pixel, knowing nothing of its labels, and of shared ground.
 
-SIFT key points (:mod:`stereotruth.tiles.sift_matches`) are matched over some rows and a wide
+SIFT key points (:mod:`stereotruth.dataset.sift_matches`) are matched over some rows and a wide
 range of disparities of either sign; least-squares matching (Gruen 1985) then finds, in a window
 around the left pixel nearest the key point, the disparity there, its two slopes, and the vertical
 parallax.
@@ -10,17 +10,24 @@ What keeps it free of bias:
   cubic B-splines, so that no sub-pixel phase is preferred to another;
 - the slopes of the grey values are the mean of both windows', so that noise draws nothing;
 - the disparity is that of the plane at the window's middle pixel, whatever the texture's centre.
+
+Ground that two pairs share (duplicates, overlaps) is found in their left images alone, of which the
+strongest SIFT features are kept: see :func:`find_shared`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import spline_filter
+from scipy.spatial import cKDTree
 
 from stereotruth.align.least_squares_matching import (
     gain_and_correlation,
@@ -30,11 +37,11 @@ from stereotruth.align.least_squares_matching import (
 )
 from stereotruth.core.kernels import inner, kernel
 from stereotruth.core.numerics.interpolation import cubic_slopes, cubic_weights
+from stereotruth.pages.pictures import stretch
 from stereotruth.tiles import sift_matches
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 
 SMOOTHING_PX = 0.7  # standard deviation: what is left aliases by less than 0.01 px
@@ -53,29 +60,16 @@ ROW_STEPS = 4
 FEW = 30  # key points matched: fewer, and other rows are tried
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(NamedTuple):
     """n matches; all in px. ``x``, ``y``: pixels of the left image (whole numbers).
 
-    ``disparity`` x_left − x_right there, ``slope_x``, ``slope_y`` its change per px, ``parallax``
-    y_right − y_left, ``sigma`` of the disparity by the residuals, ``correlation`` of the windows.
+    ``disparity`` x_left − x_right there, ``parallax`` y_right − y_left.
     """
 
     x: Floats
     y: Floats
     disparity: Floats
-    slope_x: Floats
-    slope_y: Floats
     parallax: Floats
-    sigma: Floats
-    correlation: Floats
-
-    def __len__(self) -> int:
-        return self.x.size
-
-    def take(self, chosen: NDArray[Any]) -> Matches:
-        """Those of an index or a mask."""
-        return Matches(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
     @property
     def x_right(self) -> Floats:
@@ -93,11 +87,6 @@ def grey(image: NDArray[Any]) -> Picture:
 def smooth(image: Picture) -> Picture:
     """As both images are before they are compared."""
     return cv2.GaussianBlur(image, (0, 0), SMOOTHING_PX, borderType=cv2.BORDER_REFLECT)
-
-
-def spline(image: Picture) -> Picture:
-    """Coefficients of the cubic B-spline through an image, float32[h, w]."""
-    return spline_filter(image.astype(np.float64), order=3, mode="mirror").astype(np.float32)
 
 
 @inner
@@ -245,18 +234,28 @@ def _match_all(
         _match(images, shape, weight, start[k], unknowns, move, out[k])
 
 
+def _matched(
+    pair: tuple[Picture, Picture], shape: Picture, start: Floats, unknowns: int, move: float
+) -> Floats:
+    """What :func:`_match_all` finds [n, 6] in windows of both images of a ``pair`` [h, w]."""
+    offset = np.arange(-HALF, HALF + 1) / WEIGHT_PX
+    weight = np.exp(-0.5 * (offset[:, None] ** 2 + offset[None, :] ** 2))
+    splines = (spline_filter(smooth(of).astype(np.float64), order=3, mode="mirror") for of in pair)
+    left, right = (of.astype(np.float32) for of in splines)
+    out = np.empty((len(start), 6))
+    _match_all((left, right), shape, weight, start, unknowns, move, out)
+    return out
+
+
 def least_squares(left: Picture, right: Picture, start: Floats) -> Matches:
     """Least-squares matches of a pair [h, w] from ``start`` [n, 4]: x, y, disparity, parallax.
 
     Those that do not converge near their start, or fit poorly, are left out.
     """
-    out = np.empty((len(start), 6))
-    images = spline(smooth(left)), spline(smooth(right))
-    _match_all(images, np.zeros_like(left), _weight(), start, 4, MOVE_PX, out)
-    d, parallax, along, down, sigma, correlation = out.T
-    found = Matches(start[:, 0], start[:, 1], d, along, down, parallax, sigma, correlation)
+    out = _matched((left, right), np.zeros_like(left), start, 4, MOVE_PX)
     with np.errstate(invalid="ignore"):
-        return found.take((correlation >= MIN_CORRELATION) & (sigma <= POOR_SIGMA))
+        good = (out[:, 5] >= MIN_CORRELATION) & (out[:, 4] <= POOR_SIGMA)
+    return Matches(*start[good, :2].T, *out[good, :2].T)
 
 
 def label_offsets(left: Picture, right: Picture, labels: NDArray[Any], matches: Matches) -> Floats:
@@ -266,25 +265,11 @@ def label_offsets(left: Picture, right: Picture, labels: NDArray[Any], matches: 
     than the label in its middle (0.5 px in a forest, with labels that are right to 0.03 px). So the
     window is matched once more, from where the match has it, in the shape that the labels give it.
     """
-    start = np.column_stack([matches.x, matches.y, matches.disparity, matches.parallax])
-    out = np.empty((len(matches), 6))
-    labels = np.ascontiguousarray(labels, np.float32)
-    images = spline(smooth(left)), spline(smooth(right))
-    _match_all(images, labels, _weight(), start, 2, LABEL_MOVE_PX, out)
+    start = np.column_stack(matches)
+    shape = np.ascontiguousarray(labels, np.float32)
+    out = _matched((left, right), shape, start, 2, LABEL_MOVE_PX)
     with np.errstate(invalid="ignore"):
         return np.where(out[:, 5] >= MIN_CORRELATION, -out[:, 0], np.nan)
-
-
-def _weight() -> Floats:
-    offset = np.arange(-HALF, HALF + 1) / WEIGHT_PX
-    return np.exp(-0.5 * (offset[:, None] ** 2 + offset[None, :] ** 2))
-
-
-def _without_nodata(picture: Picture, half: int) -> Bools:
-    """Pixels around which no pixel is nodata (0) within ``half`` px."""
-    empty = (picture == 0).astype(np.uint8)
-    blank = cv2.dilate(empty, np.ones((2 * half + 1,) * 2, np.uint8))
-    return blank == 0
 
 
 def match_pair(
@@ -314,7 +299,127 @@ def match_pair(
     _, first = np.unique(start[:, :2], axis=0, return_index=True)  # key points of one pixel
     start = start[np.sort(first)]
     if nodata:
-        inside = _without_nodata(a, HALF)
-        rows, cols = start[:, 1].astype(int), start[:, 0].astype(int)
-        start = start[inside[np.clip(rows, 0, len(a) - 1), np.clip(cols, 0, a.shape[1] - 1)]]
+        blank = cv2.dilate((a == 0).astype(np.uint8), np.ones((2 * HALF + 1,) * 2, np.uint8))
+        cols, rows = start[:, :2].astype(int).T
+        start = start[blank[np.clip(rows, 0, len(a) - 1), np.clip(cols, 0, a.shape[1] - 1)] == 0]
     return least_squares(a, b, start)
+
+
+# ------------------------------------------------------------------------------- shared ground
+
+FEATURES = 800  # of an image, the strongest
+COMPONENTS = 14
+QUERIES = 200  # of them, evenly chosen, are looked up
+NEIGHBOURS = 6  # of a feature, in other images
+AXES_FROM = 100_000  # features, evenly chosen, that the principal components are taken of
+COMPARED = 60  # images: so few are all compared with each other; of more those with more neighbours
+UNLIKELY = 4.0  # than by chance, by so many standard deviations
+RATIO = 0.85
+REPROJECTION_PX = 3.0
+MIN_INLIERS = 8
+SCALE = 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """The strongest features of an image: ``place`` (x, y) px [n, 2], ``vector`` float16[n, 128].
+
+    ``shape`` of the image, rows and columns.
+    """
+
+    place: Floats
+    vector: NDArray[np.float16]
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Two images, by number, that show common ground: matches, and its share of the first one."""
+
+    first: int
+    second: int
+    matches: int
+    share: float
+
+
+def features(image: NDArray[Any]) -> Features:
+    """Features of an image [h, w] or [h, w, 3]."""
+    picture = stretch(grey(image), percent=(0.1, 99.9))
+    found, vectors = cv2.SIFT_create(nfeatures=FEATURES).detectAndCompute(picture, None)
+    if not found:
+        return Features(np.empty((0, 2)), np.empty((0, 128), np.float16), picture.shape)
+    root = np.sqrt(vectors / np.maximum(vectors.sum(axis=1, keepdims=True), 1e-9))
+    order = np.lexsort([[k.pt[i] for k in found] for i in (0, 1)])
+    return Features(
+        np.array([k.pt for k in found])[order], root[order].astype(np.float16), picture.shape
+    )
+
+
+def find_shared(images: Sequence[Features]) -> list[Shared]:
+    """All pairs of images that share ground, the first number the smaller.
+
+    Two images with more features alike than chance gives are compared feature by feature, and one
+    similarity transformation (RANSAC) must explain ``MIN_INLIERS`` matches. Crops, offsets, other
+    grey values, rotations and scales up to ``SCALE`` do no harm.
+    """
+    found = []
+    for first, second in _candidates(images):
+        matches, share = compare(images[first], images[second])
+        if matches >= MIN_INLIERS:
+            found.append(Shared(first, second, matches, share))
+    return found
+
+
+def _candidates(images: Sequence[Features]) -> list[tuple[int, int]]:
+    """Pairs of images of which more features look alike than by chance."""
+    if len(images) <= COMPARED:
+        return list(combinations(range(len(images)), 2))
+    sizes = [len(image.vector) for image in images]
+    ends = np.cumsum([0, *sizes])
+    owner = np.repeat(np.arange(len(images)), sizes)
+    every = max(1, -(-owner.size // AXES_FROM))
+    some = np.concatenate([image.vector[::every] for image in images]).astype(np.float64)
+    middle = some.mean(axis=0)
+    _, axes = np.linalg.eigh((some - middle).T @ (some - middle))
+    axes = axes[:, ::-1][:, :COMPONENTS]
+    reduced = np.concatenate([(image.vector - middle) @ axes for image in images])
+    tree = cKDTree(reduced)
+    votes: Counter[tuple[int, int]] = Counter()
+    for number, (begin, end) in enumerate(pairwise(ends)):
+        asked = np.arange(begin, end, max(1, -(-(end - begin) // QUERIES)))
+        _, near = tree.query(reduced[asked], k=min(NEIGHBOURS + 1, owner.size))
+        for row in owner[near]:
+            others = set(row.tolist()) - {number}
+            votes.update((min(number, other), max(number, other)) for other in others)
+    expected = 2 * votes.total() / (len(images) * (len(images) - 1))
+    enough = expected + UNLIKELY * np.sqrt(expected)
+    return sorted(pair for pair, count in votes.items() if count > enough)
+
+
+def compare(a: Features, b: Features) -> tuple[int, float]:
+    """Matches that one similarity explains, and the share of the first image that they show."""
+    if min(len(a.vector), len(b.vector)) < 3:
+        return 0, 0.0
+    alike = a.vector.astype(np.float32) @ b.vector.astype(np.float32).T  # rows of unit length
+    best = np.argmax(alike, axis=1)
+    ordered = np.partition(alike, -2, axis=1)
+    near, next_near = (np.sqrt(np.maximum(2 - 2 * ordered[:, k], 0)) for k in (-1, -2))
+    mutual = np.argmax(alike, axis=0)[best] == np.arange(best.size)
+    good = np.flatnonzero(mutual & (near < RATIO * next_near))
+    if good.size < 3:
+        return 0, 0.0
+    cv2.setRNGSeed(0)
+    transform, inlier = cv2.estimateAffinePartial2D(
+        a.place[good], b.place[best[good]], ransacReprojThreshold=REPROJECTION_PX, maxIters=5000
+    )
+    if transform is None or not 1 / SCALE <= np.hypot(*transform[:, 0]) <= SCALE:
+        return 0, 0.0
+    # features of one place in several orientations are one match
+    places = np.unique(np.rint(a.place[good][inlier.ravel() > 0]), axis=0)
+    frame, there = (
+        np.array([[0, 0], [cols, 0], [cols, rows], [0, rows]], np.float32)
+        for rows, cols in (b.shape, a.shape)
+    )
+    there = (there @ transform[:, :2].T + transform[:, 2]).astype(np.float32)
+    area, _ = cv2.intersectConvexConvex(there, frame)
+    return len(places), float(area / max(cv2.contourArea(there), 1e-9))

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from stereotruth.core.config.methods import AuditLimits
+from stereotruth.core.config.methods import Audit, AuditLimits
 from stereotruth.core.products.rasters import read_image
 from stereotruth.pages import pictures
 from stereotruth.pages.figures import AXES, Chart, Plot, look, styled
@@ -20,10 +20,9 @@ from stereotruth.pages.pictures import Scale, encode
 from stereotruth.pages.tables import Cell, Headline, Table, minus, table, value_cell, words
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
-from .matches import grey, label_offsets, match_pair
-from .pair import EXTRA_PX, estimate
-from .summary import Audited, table_rows
-from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED
+from .matches import grey, label_offsets
+from .pair import estimate, matches_of
+from .verdicts import CHECKS, FAULT, GOOD, NOTE, UNDECIDED, Audited, as_text, table_rows
 
 Picture = pictures.Picture
 
@@ -56,17 +55,16 @@ def write_audit(
     dataset: StereoDataset,
     audited: Sequence[Audited],
     summary: Mapping[str, Any],
-    limits: AuditLimits,
-    worst: int,
+    settings: Audit,
     *,
     index: str | None = None,
 ) -> None:
-    """Write the page; ``worst``: pairs that are shown in pictures; ``index``: the way to all pages.
+    """Write the page; ``index``: the way to all pages.
 
     ``path`` lies beside the audit's other files.
     """
-    order = sorted(audited, key=lambda a: (-a.severity(limits), a.pair.name))
-    chosen = order[:worst]
+    order = sorted(audited, key=lambda a: (-a.severity(settings), a.pair.name))
+    chosen = order[: settings.worst]
     shown = {a.pair.name for a in chosen}
     values = {
         "index": index,
@@ -79,8 +77,13 @@ def write_audit(
         ],
         "headlines": headlines(summary),
         "checks": _checks(summary),
-        "chart": all_pairs(audited, limits, shown),
-        "pooled": table(_pooled_rows(summary)),
+        "chart": all_pairs(audited, settings, shown),
+        "pooled": table(
+            [
+                {"figure": words(name), **{key: as_text(value) for key, value in of.items()}}
+                for name, of in summary["pooled"].items()
+            ]
+        ),
         "shared": _shared(summary),
         "conventions": [
             (words(name), ", ".join(f"{value} ({n} pairs)" for value, n in counts.items()))
@@ -141,7 +144,7 @@ def all_pairs(audited: Sequence[Audited], limits: AuditLimits, linked: set[str])
     plot.axis.add_patch(Rectangle(corner, *size, facecolor=AXES, alpha=0.25))
     values = []
     for number, (verdict, word) in enumerate(WORDS.items()):
-        of = [a for a in audited if a.verdict.word == verdict and a.pair.name in at]
+        of = [a for a in audited if a.verdict == verdict and a.pair.name in at]
         if not of:
             continue
         names = [a.pair.name for a in of]
@@ -197,17 +200,9 @@ def _pairs(audited: Sequence[Audited], shown: set[str]) -> Table | None:
     """The table of all pairs; each fault has its line, and a click leads to the pictures."""
     rows = table_rows(audited)
     for row, a in zip(rows, audited):
-        row["faults"] = minus("\n".join(f.text.replace("; ", "\n") for f in a.verdict.of(FAULT)))
-        row["verdict"] = WORDS[a.verdict.word]
+        row["faults"] = minus("\n".join(f.text.replace("; ", "\n") for f in a.of(FAULT)))
+        row["verdict"] = WORDS[a.verdict]
     return table(rows, COLUMNS, {"pair": {name: f"#pair-{name}" for name in shown}})
-
-
-def _pooled_rows(summary: Mapping[str, Any]) -> list[dict[str, str]]:
-    rows = []
-    for name, of in summary["pooled"].items():
-        text = {k: "" if of[k] is None else f"{of[k]:.4f}" for k in of if k != "pairs"}
-        rows.append({"figure": words(name), "pairs": str(of["pairs"]), **text})
-    return rows
 
 
 def _dots(picture: Picture, x: NDArray, y: NDArray, values: NDArray, limit: float) -> Picture:
@@ -232,12 +227,12 @@ def _tile(dataset: StereoDataset, a: Audited) -> dict[str, Any]:
         "name": a.pair.name,
         "city": a.pair.city,
         "split": a.pair.split,
-        "verdict": a.verdict.word,
-        "word": WORDS[a.verdict.word],
+        "verdict": a.verdict,
+        "word": WORDS[a.verdict],
         "findings": [
             (f.level, minus(text))
             for level in (FAULT, UNDECIDED, NOTE)
-            for f in a.verdict.of(level)
+            for f in a.of(level)
             for text in f.text.split("; ")
         ],
         "pictures": [],
@@ -260,8 +255,7 @@ def _tile(dataset: StereoDataset, a: Audited) -> dict[str, Any]:
         add("labels", coloured, Scale.of(pictures.DISPARITIES, *ends))
     if "rows" not in a.figures:
         return found
-    reach = max(abs(v) for v in dataset.disparity_range) + EXTRA_PX
-    matches = match_pair(left, right, reach, nodata=left.dtype != np.uint8)
+    matches = matches_of(dataset, left, right)
     x, y = matches.x, matches.y
     dots = _dots(grey_left, x, y, matches.parallax, ROW_LIMIT_PX)
     add("vertical parallax", dots, differences(ROW_LIMIT_PX))

@@ -6,29 +6,34 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stereotruth.core.products.rasters import read_image, read_labels
+from stereotruth.epipolar.warping import warp_rows
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
-from . import conventions, hidden
-from .contradiction import REACH_PX, scan_labels
+from . import label_checks
 from .estimates import NOTHING, Estimate, cells, robust_fit, scale_of
+from .label_checks import AS_STATED, LARGER, SIGN, SMALLER, SWAPPED, SWAPPED_SIGN
 from .matches import Matches, grey, label_offsets, match_pair, smooth
-from .registration import better_place
 
 Picture = NDArray[np.float32]
 Floats = NDArray[np.float64]
+Labels = NDArray[np.float32]  # [h, w] px, NaN: none
 
 
 OFF_ROW_PX = 1.0  # a match that is further off the rows' trend
 GROSS_PX = 3.0  # a match that is further off the labels' bias
+POOR = 0.5  # correlation, less of which counts as such
 EXTRA_PX = 32.0  # disparities are looked for so far beyond the stated range
-QUANTILES = (1, 50, 99)
-SATURATED = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}
 CERTAIN = 0.01  # level at which a convention or an order in depth is taken over
+
+
+def matches_of(dataset: StereoDataset, left: NDArray[Any], right: NDArray[Any]) -> Matches:
+    """Matches of a dataset's pair [h, w] or [h, w, 3]."""
+    reach = max(abs(v) for v in dataset.disparity_range) + EXTRA_PX
+    return match_pair(left, right, reach, nodata=left.dtype != np.uint8)
 
 
 def measure(dataset: StereoDataset, pair: Pair) -> dict[str, Any]:
@@ -37,87 +42,81 @@ def measure(dataset: StereoDataset, pair: Pair) -> dict[str, Any]:
     Raises InputError if a file cannot be read.
     """
     left, right = read_image(pair.left), read_image(pair.right)
-    raw, stated = _raw_labels(pair)
-    labels = None if raw is None else dataset.labels(pair)
-    shapes = [left.shape, right.shape] + ([] if raw is None else [raw.shape])
+    arrays = [left, right]
+    labels, of_labels = None, {}
+    if pair.disparity is not None:
+        raw, nodata = read_labels(pair.disparity)
+        arrays.append(raw)
+        labels = dataset.labels(pair)
+        facts = label_checks.label_values(labels, dataset.disparity_range)._asdict()
+        of_labels = {"labels": {"dtype": str(raw.dtype), "nodata_tag": nodata, **facts}}
+    hashes = [_hash(array) for array in arrays]
     found: dict[str, Any] = {
         "shape": list(left.shape),
         "dtype": [str(left.dtype), str(right.dtype)],
-        "same_shape": shapes[0] == shapes[1] and all(s[:2] == shapes[0][:2] for s in shapes),
-        "hashes": [_hash(array) for array in (left, right, raw) if array is not None],
-        "images": {name: _image(array) for name, array in (("left", left), ("right", right))},
+        "same_shape": left.shape == right.shape
+        and all(array.shape[:2] == left.shape[:2] for array in arrays),
+        "hashes": hashes,
+        "grey_values": {"left": np.unique(left).size, "right": np.unique(right).size},
+        "identical_images": hashes[0] == hashes[1],
+        **of_labels,
     }
-    found["identical_images"] = found["hashes"][0] == found["hashes"][1]
-    if labels is not None:
-        found["labels"] = stated | _values(labels, dataset)
     if not found["same_shape"] or found["identical_images"]:
         return found
-    reach = max(abs(v) for v in dataset.disparity_range) + EXTRA_PX
-    spikes = [value for value, _ in found.get("labels", {}).get("spikes", [])]
-    matches = match_pair(left, right, reach, nodata=left.dtype != np.uint8)
+    spikes = [value for value, _ in of_labels["labels"]["spikes"]] if of_labels else []
     return found | measure_arrays(
-        left, right, labels, matches, spikes=spikes, grows=dataset.grows_with_height
+        left,
+        right,
+        labels,
+        matches_of(dataset, left, right),
+        spikes=spikes,
+        grows=dataset.grows_with_height,
     )
 
 
 def measure_arrays(
     left: NDArray[Any],
     right: NDArray[Any],
-    labels: NDArray[np.float32] | None,
+    labels: Labels | None,
     matches: Matches,
     *,
     spikes: Sequence[float] = (),
     grows: bool = True,
 ) -> dict[str, Any]:
-    """What images [h, w] or [h, w, 3] and labels (px, NaN: none) say of each other, JSON-ready.
+    """What images [h, w] or [h, w, 3] and labels say of each other, JSON-ready.
 
     ``matches`` of the two images; ``spikes``: values of labels that are suspiciously frequent;
     ``grows``: whether disparities are said to grow with height.
     """
-    found: dict[str, Any] = {"matches": len(matches)}
-    if len(matches):
-        found["disparity"] = [float(v) for v in np.percentile(matches.disparity, QUANTILES)]
-    found["rows"], trend = _rows(matches, left.shape)
-    if labels is not None:
-        pictures = grey(left), grey(right)
-        found |= _against_labels(*pictures, labels, matches, trend, spikes, grows)
-    return found
-
-
-def _against_labels(
-    left: Picture,
-    right: Picture,
-    labels: NDArray[np.float32],
-    matches: Matches,
-    trend: tuple[float, float, float],
-    spikes: Sequence[float],
-    grows: bool,
-) -> dict[str, Any]:
-    meaning, more = conventions.convention(labels, matches)
-    found: dict[str, Any] = {"convention": {"best": meaning, "more": _plain(more)}}
-    taken = meaning if more.interval(CERTAIN)[0] > 0 else conventions.AS_STATED
-    found["convention"]["taken"] = taken
-    if taken in (conventions.SWAPPED, conventions.SWAPPED_SIGN):
-        left, right, matches = right, left, conventions.swapped(matches)
+    found: dict[str, Any] = {"matches": matches.x.size}
+    found["rows"], trend = _rows(matches, left.shape[:2])
+    if labels is None:
+        return found
+    left, right = grey(left), grey(right)
+    meaning, more = label_checks.convention(labels, matches)
+    taken = meaning if more.interval(CERTAIN)[0] > 0 else AS_STATED
+    found["convention"] = {"best": meaning, "more": _plain(more), "taken": taken}
+    if taken in (SWAPPED, SWAPPED_SIGN):
+        left, right, matches = right, left, label_checks.swapped(matches)
         trend = tuple(-v for v in trend)
-    if taken in (conventions.SIGN, conventions.SWAPPED_SIGN):
+    if taken in (SIGN, SWAPPED_SIGN):
         labels, spikes = -labels, [-value for value in spikes]
-    found["bias"], bias = _bias(label_offsets(left, right, labels, matches), matches, labels.shape)
+    errors = label_offsets(left, right, labels, matches)
+    found["bias"], bias = _bias(errors, matches, labels.shape)
     found["spikes"] = [
-        _plain(conventions.wrong_at(labels, value, bias, matches)) for value in spikes
+        _plain(label_checks.wrong_at(labels, value, bias, matches)) for value in spikes
     ]
     aligned = _to_rows(right, trend)
     true = labels - np.float32(bias)
-    found["contradicted"] = _contradicted(left, aligned, true, matches)
+    found["contradicted"] = _contradicted(smooth(left), smooth(aligned), true, matches)
     found["hidden"] = _hidden(left, aligned, true, grows)
-    move, gain = better_place(smooth(left), smooth(aligned), true)
+    move, gain = label_checks.better_place(smooth(left), smooth(aligned), true)
     found["registration"] = {"move": list(move), "gain": _plain(gain)}
     return found
 
 
 def _plain(estimate: Estimate) -> list[float | int | None]:
-    error = estimate.error if np.isfinite(estimate.error) else None
-    value = estimate.value if np.isfinite(estimate.value) else None
+    value, error = (v if np.isfinite(v) else None for v in (estimate.value, estimate.error))
     return [value, error, estimate.freedom]
 
 
@@ -126,60 +125,44 @@ def _hash(array: NDArray[Any]) -> str:
     return hashlib.sha256(head + np.ascontiguousarray(array).tobytes()).hexdigest()
 
 
-def _raw_labels(pair: Pair) -> tuple[NDArray[Any] | None, dict[str, Any]]:
-    """The label file as it is, and what it says of itself."""
-    if pair.disparity is None:
-        return None, {}
-    values, nodata = read_labels(pair.disparity)
-    return values, {"dtype": str(values.dtype), "nodata_tag": nodata}
-
-
-def _image(image: NDArray[Any]) -> dict[str, Any]:
-    top = SATURATED.get(image.dtype)
-    return {
-        "zero": float(np.mean(image == 0)),
-        "saturated": 0.0 if top is None else float(np.mean(image == top)),
-        "levels": int(np.unique(image).size),
-    }
-
-
-def _values(labels: NDArray[np.float32], dataset: StereoDataset) -> dict[str, Any]:
-    facts = conventions.label_values(labels, dataset.disparity_range)._asdict()
-    return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in facts.items()}
+def _trend(values: Floats, x: Floats, y: Floats, shape: tuple[int, ...]) -> list[Estimate]:
+    """Values [n] in the middle of a pair, and what they change by to its right and lower edge."""
+    if not values.size:
+        return [NOTHING] * 3
+    height, width = shape
+    u, v = (2 * x - width) / width, (2 * y - height) / height
+    return robust_fit(np.column_stack([np.ones(x.size), u, v]), values, cells(x, y))
 
 
 def _rows(
     matches: Matches, shape: tuple[int, ...]
 ) -> tuple[dict[str, Any], tuple[float, float, float]]:
-    """The vertical parallax: at the middle, and from there to the edges along x and y."""
-    height, width = shape[:2]
-    u, v = (2 * matches.x - width) / width, (2 * matches.y - height) / height
-    design = np.column_stack([np.ones(len(matches)), u, v])
-    group = cells(matches.x, matches.y)
-    tilted = robust_fit(design, matches.parallax, group) if len(matches) else [NOTHING] * 3
-    known = np.isfinite([e.value for e in tilted]).all()
-    at = tuple(e.value for e in tilted) if known else (0.0, 0.0, 0.0)
-    off = matches.parallax - design @ np.array(at)
+    """The vertical parallax; and as a plane: at column and row 0, by column, by row."""
+    height, width = shape
+    trend = _trend(matches.parallax, matches.x, matches.y, shape)
+    at = np.array([of.value for of in trend])
+    at = at if np.isfinite(at).all() else np.zeros(3)
+    plane = (float(at[0] - at[1] - at[2]), float(2 * at[1] / width), float(2 * at[2] / height))
+    off = matches.parallax - (plane[0] + plane[1] * matches.x + plane[2] * matches.y)
     return {
-        "parallax": _plain(tilted[0]),
-        "tilt_x": _plain(tilted[1]),
-        "tilt_y": _plain(tilted[2]),
-        "spread": scale_of(off) if len(matches) else None,
-        "off_row": float(np.mean(np.abs(off) > OFF_ROW_PX)) if len(matches) else None,
-    }, (at[0] - at[1] - at[2], 2 * at[1] / width, 2 * at[2] / height)
+        **{name: _plain(of) for name, of in zip(("parallax", "tilt_x", "tilt_y"), trend)},
+        "spread": scale_of(off) if off.size else None,
+        "off_row": float(np.mean(np.abs(off) > OFF_ROW_PX)) if off.size else None,
+    }, plane
 
 
-def _to_rows(right: Picture, trend: tuple[float, float, float]) -> Picture:
-    """The right image with its rows brought to the left ones: c + a x + b y px lower there."""
-    level, along, down = trend
-    matrix = np.array([[1.0, 0.0, 0.0], [along, 1.0 + down, level]])
-    return cv2.warpAffine(
-        right,
-        matrix,
-        right.shape[::-1],
-        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REFLECT,
-    )
+def _to_rows(right: Picture, plane: tuple[float, float, float]) -> Picture:
+    """The right image with its rows brought to the left ones, which lie as the plane says lower.
+
+    Its first and last row go on beyond it; 0 is nodata.
+    """
+    level, along, down = plane
+    rows, cols = right.shape
+    y, x = np.mgrid[:rows, :cols]
+    lower = np.clip(y + level + along * x + down * y, -1.0, float(rows))
+    wide = np.pad(right, ((2, 3), (0, 0)), mode="edge")
+    moved = warp_rows(np.ascontiguousarray(wide.T), np.ascontiguousarray(lower.T) + 2.0)
+    return np.ascontiguousarray(np.nan_to_num(moved).T, np.float32)
 
 
 def _bias(errors: Floats, matches: Matches, shape: tuple[int, ...]) -> tuple[dict[str, Any], float]:
@@ -188,70 +171,60 @@ def _bias(errors: Floats, matches: Matches, shape: tuple[int, ...]) -> tuple[dic
     errors, x, y = errors[known], matches.x[known], matches.y[known]
     if not errors.size:
         return {"matches": 0, "bias": _plain(NOTHING)}, 0.0
-    group = cells(x, y)
-    height, width = shape
-    u, v = (2 * x - width) / width, (2 * y - height) / height
-    tilted = robust_fit(np.column_stack([np.ones(x.size), u, v]), errors, group)
-    bias = tilted[0].value if np.isfinite(tilted[0].value) else float(np.median(errors))
+    trend = _trend(errors, x, y, shape)
+    bias = trend[0].value if np.isfinite(trend[0].value) else float(np.median(errors))
     return {
         "matches": errors.size,
-        "bias": _plain(tilted[0]),
-        "median": float(np.median(errors)),
-        "tilt_x": _plain(tilted[1]),
-        "tilt_y": _plain(tilted[2]),
+        **{name: _plain(of) for name, of in zip(("bias", "tilt_x", "tilt_y"), trend)},
         "spread": scale_of(errors),
         "gross": float(np.mean(np.abs(errors - bias) > GROSS_PX)),
     }, bias
 
 
 def _contradicted(
-    left: Picture, right: Picture, labels: NDArray[np.float32], matches: Matches
+    left: Picture, right: Picture, labels: Labels, matches: Matches
 ) -> dict[str, Any]:
     known = np.concatenate([labels[np.isfinite(labels)], matches.disparity])
+    nothing = {"labels": 0, "share": _plain(NOTHING)}
     if not known.size:
-        return {"labels": 0, "share": _plain(NOTHING)}
+        return nothing
     low, high = np.percentile(known, (0.5, 99.5))
-    scan = scan_labels(smooth(left), smooth(right), labels, (low - 4.0, high + 4.0))
+    scan = label_checks.scan_labels(left, right, labels, (low - 4.0, high + 4.0))
     if not scan.x.size:
-        return {"labels": 0, "share": _plain(NOTHING)}
+        return nothing
     return {
         "labels": scan.x.size,
         "share": _plain(scan.contradicted()),
-        "beaten": float(scan.beaten.mean()),
-        "beaten_by_chance": float(scan.beaten_by_chance.mean()),
-        "correlation": float(np.median(scan.here)),
-        "poor": float(np.mean(scan.here < 0.5)),
-        "reach": min(float(high - low) + 8.0, float(REACH_PX)),
+        "poor": float(np.mean(scan.here < POOR)),
     }
 
 
-def _hidden(
-    left: Picture, right: Picture, labels: NDArray[np.float32], grows: bool
-) -> dict[str, Any]:
+def _hidden(left: Picture, right: Picture, labels: Labels, grows: bool) -> dict[str, Any]:
     """Who is in front is as the images tell, else as stated."""
-    front = hidden.who_is_in_front(left, right, labels)
+    front = label_checks.who_is_in_front(left, right, labels)
     low, high = front.interval(CERTAIN)
     nearer = None
-    if low > hidden.CLEAR or high < -hidden.CLEAR:
-        nearer = hidden.LARGER if low > 0 else hidden.SMALLER
-    count = max(int(np.isfinite(labels).sum()), 1)
-    shares = {
-        side: float(hidden.hidden_labels(labels, side).sum() / count)
-        for side in (hidden.LARGER, hidden.SMALLER)
-    }
+    if low > label_checks.IN_FRONT or high < -label_checks.IN_FRONT:
+        nearer = LARGER if low > 0 else SMALLER
+    stated = LARGER if grows else SMALLER
+    hidden = label_checks.hidden_labels(labels, nearer or stated)
     return {
         "nearer": nearer,
-        "evidence": _plain(front),
-        "share": shares[nearer or (hidden.LARGER if grows else hidden.SMALLER)],
-        "shares": shares,
+        "share": float(hidden.sum() / max(int(np.isfinite(labels).sum()), 1)),
     }
+
+
+def figure(figures: Mapping[str, Any], *names: str) -> Any:
+    """What stands among the figures of :func:`measure`, by the names on the way to it; or None."""
+    at: Any = figures
+    for name in names:
+        at = (at or {}).get(name)
+    return at
 
 
 def estimate(figures: Mapping[str, Any], *names: str) -> Estimate:
     """An estimate among the figures of :func:`measure`, by the names on the way to it."""
-    at: Any = figures
-    for name in names:
-        at = (at or {}).get(name)
+    at = figure(figures, *names)
     if at is None or at[0] is None or at[1] is None:
         return NOTHING
     return Estimate(float(at[0]), float(at[1]), int(at[2]))

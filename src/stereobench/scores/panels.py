@@ -50,11 +50,6 @@ class Column:
     found: Mapping[str, Disparity]
 
 
-def grey(image: NDArray[Any]) -> Picture:
-    """An image to look at: stretched to 8 bits, colour as it is."""
-    return image if image.ndim == 3 else stretch(image)
-
-
 def error_picture(found: Disparity, truth: Disparity) -> Picture:
     """Absolute errors in colour; unlabelled and invalid pixels in theirs."""
     picture = colours(np.abs(found - truth), (0.0, ERROR_PX), ERRORS)
@@ -81,8 +76,10 @@ def draw_columns(path: str | Path, columns: Sequence[Column], *, across: bool = 
     ``across``: pairs one below the other, and what belongs to a pair side by side.
     """
     limits = disparity_limits(columns)
-    cells = [_cells(column, limits) for column in columns]
-    names = sorted({name for of in cells for name in of}, key=_order(columns).index)
+    cells = [pictures_of(column, limits) for column in columns]
+    methods = list(dict.fromkeys(name for column in columns for name in column.found))
+    order = ["left", "right", "truth", *methods, *(f"error of {name}" for name in methods)]
+    names = [name for name in order if any(name in of for of in cells)]
     grid = (len(columns), len(names)) if across else (len(names), len(columns))
     aspect = columns[0].left.shape[0] / columns[0].left.shape[1]
     size = INCHES if across else INCHES * 0.8
@@ -111,15 +108,12 @@ def draw_columns(path: str | Path, columns: Sequence[Column], *, across: bool = 
     save_figure(path, figure, dpi=DPI)
 
 
-def map_pictures(column: Column) -> tuple[tuple[float, float], dict[str, Picture]]:
-    """Limits of the disparities' colours, and the pictures of a pair by name."""
-    limits = disparity_limits([column])
-    return limits, _cells(column, limits)
-
-
-def _cells(column: Column, limits: tuple[float, float]) -> dict[str, Picture]:
+def pictures_of(column: Column, limits: tuple[float, float]) -> dict[str, Picture]:
     """Pictures of a pair by name, in the order of figure 10."""
-    found = {"left": grey(column.left), "right": grey(column.right)}
+    found = {
+        name: image if image.ndim == 3 else stretch(image)
+        for name, image in (("left", column.left), ("right", column.right))
+    }
     if column.truth is not None:
         found["truth"] = colours(column.truth, limits)
     found |= {name: colours(of, limits) for name, of in column.found.items()}
@@ -127,12 +121,6 @@ def _cells(column: Column, limits: tuple[float, float]) -> dict[str, Picture]:
         for name, of in column.found.items():
             found[f"error of {name}"] = error_picture(of, column.truth)
     return found
-
-
-def _order(columns: Sequence[Column]) -> list[str]:
-    """Names of the pictures of all pairs, in the order of figure 10."""
-    methods = list(dict.fromkeys(name for column in columns for name in column.found))
-    return ["left", "right", "truth", *methods, *(f"error of {name}" for name in methods)]
 
 
 def _legend(

@@ -15,18 +15,21 @@ same: labels may change without any pair being matched again.
 from __future__ import annotations
 
 import json
+import os
 import platform
 import re
 import resource
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from importlib.metadata import Distribution, distribution, packages_distributions
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from stereotruth.core.errors import InputError, without_secrets
@@ -38,23 +41,16 @@ from stereotruth.core.products.rasters import image_shape, read_image, write_dis
 from stereotruth.core.products.resumable_grids import Ledger
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
-from ..methods.kinds import FOLDER, MOVED, TOLD
+from ..methods.kinds import FOLDER, MCCNN, MOVED, TOLD, names_of, place_of
 from ..methods.matcher import BatchMatcher, ImagePair, Matched, Matcher, UncertainMatcher
 from ..methods.methods import make_method
 from ..methods.user_methods import SUFFIXES, read_result
-from .identity import identity, machine
-from .prediction_files import RECORD, UNCERTAINTY
-from .submission import SUBMITTED, Submission
+from .prediction_files import RECORD, SUBMITTED, UNCERTAINTY, Submission
 
 MB = 1 << 20
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """One pair: seconds it took (None if it was not run here), peak memory of the process in MB."""
-
-    seconds: float | None
-    memory_mb: float | None
+Took = dict[str, float | None]  # of a pair: seconds (None: not run here), peak memory_mb
 
 
 def predict(
@@ -102,7 +98,7 @@ def predict(
         if piece is None:
             missing.append(pair)
         else:
-            found[pair.name] = Prediction(**piece.result)
+            found[pair.name] = piece.result
     made = progress(maker(missing), len(missing), f"{name}: pairs matched")
     for pair, result in zip(missing, made, strict=True):
         places = _maps(work, pair)
@@ -111,8 +107,11 @@ def predict(
         if result.uncertainty is not None:
             write_disparity(places[UNCERTAINTY], result.uncertainty)
         refuse_replaced(before | seen[pair.name])
-        took = Prediction(result.seconds and round(result.seconds, 6), result.memory_mb)
-        ledger.put(pair.name, keys[pair.name], places, vars(took))
+        took = {
+            "seconds": result.seconds and round(result.seconds, 6),
+            "memory_mb": result.memory_mb,
+        }
+        ledger.put(pair.name, keys[pair.name], places, took)
         found[pair.name] = took
     record = {
         "dataset": dataset.name,
@@ -129,7 +128,7 @@ def predict(
         "threads": workers,
         **_summary(found),
         **({SUBMITTED: maker.submission.scores} if maker.submission else {}),
-        "pairs": {pair.name: vars(found[pair.name]) for pair in pairs},
+        "pairs": {pair.name: found[pair.name] for pair in pairs},
     }
     text = json.dumps(record, indent=2) + "\n"
     with atomic_folder(out) as scratch:
@@ -264,10 +263,10 @@ def _check(result: Matched, pair: Pair, name: str) -> None:
         )
 
 
-def _summary(found: Mapping[str, Prediction]) -> dict[str, float | None]:
+def _summary(found: Mapping[str, Took]) -> dict[str, float | None]:
     """Median time of a pair, with what the middle 95 % of the pairs took; largest memory."""
-    seconds = [of.seconds for of in found.values() if of.seconds is not None]
-    memory = [of.memory_mb for of in found.values() if of.memory_mb is not None]
+    seconds = [of["seconds"] for of in found.values() if of["seconds"] is not None]
+    memory = [of["memory_mb"] for of in found.values() if of["memory_mb"] is not None]
     return {
         "median_seconds": round(median(seconds), 6) if seconds else None,
         "median_seconds_low": round(float(np.quantile(seconds, 0.025)), 6) if seconds else None,
@@ -286,3 +285,77 @@ def peak_memory_mb() -> float:
         return int(found[1]) / 1024
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MB
+
+
+# ---------------------------------------------------------------------------- what a method is
+
+GIB = 1 << 30
+INSTALLED = {"sgm": ["cv2"], "pandora": ["pandora"]}  # packages that kinds are made of,
+OF_PIPELINE = {MCCNN: ["mc_cnn"]}  # and pipelines of Pandora
+LICENCES = {"pandora": "Apache License 2.0"}  # of distributions whose files do not state it
+
+
+def identity(
+    settings: Mapping[str, Any], files: Sequence[str | Path] = (), code: str = ""
+) -> dict[str, Any]:
+    """Licence, version and checksums of a method, from its configuration entry.
+
+    ``licence`` and ``version``: as the entry states them, else those of the installed distributions
+    that hold SGM, Pandora, MC-CNN or the user's function, else None. ``files``: SHA-256 of the
+    method's files by name (weights, the user's code). ``code``: digest of this package's code that
+    runs it.
+    """
+    found = _distributions(settings)
+    licences = dict.fromkeys(filter(None, map(_licence, found)))
+    versions = (f"{one.name} {one.version}" for one in found)
+    return {
+        "licence": settings.get("licence") or ", ".join(licences) or None,
+        "version": settings.get("version") or ", ".join(versions) or None,
+        "files": {name: file_sha256(path) for name, path in names_of([*map(Path, files)]).items()},
+        "code": code or None,
+    }
+
+
+def machine() -> dict[str, Any]:
+    """System, processor, cores that may be used, memory in GiB, GPU and Python of this machine."""
+    torch = sys.modules.get("torch")  # if nothing has imported it, no GPU is used
+    gpu = torch.cuda.get_device_name() if torch and torch.cuda.is_available() else None
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "system": f"{platform.system()} {platform.release()}",
+        "processor": _processor(),
+        "cores": cores,
+        "memory_gib": round(psutil.virtual_memory().total / GIB, 1),
+        "gpu": gpu,
+        "python": platform.python_version(),
+    }
+
+
+def _processor() -> str:
+    about = Path("/proc/cpuinfo")
+    text = about.read_text(encoding="utf-8", errors="replace") if about.exists() else ""
+    named = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    return named[1].strip() if named else platform.processor() or platform.machine()
+
+
+def _distributions(settings: Mapping[str, Any]) -> list[Distribution]:
+    """The installed ones that SGM, Pandora and its pipeline, or the user's function come from."""
+    tops: list[str] = []
+    if settings["kind"] in INSTALLED:
+        tops = INSTALLED[settings["kind"]] + OF_PIPELINE.get(settings.get("pipeline") or "", [])
+    elif settings["kind"] == "function":
+        with suppress(InputError):
+            place, _ = place_of(settings["function"])
+            tops = [] if place.endswith(".py") else [place.partition(".")[0]]
+    names = packages_distributions()
+    return [distribution(names[top][0]) for top in tops if top in names]
+
+
+def _licence(found: Distribution) -> str | None:
+    """Its name, where the distribution states it in a line or by a classifier."""
+    about = found.metadata
+    stated = [(about.get(key) or "").strip() for key in ("License-Expression", "License")]
+    classes = [c for c in about.get_all("Classifier") or () if "License ::" in c]
+    named = [text for text in stated if text and "\n" not in text]
+    named += [text.rpartition(" :: ")[2] for text in classes]
+    return next(iter(named), LICENCES.get(found.name))

@@ -5,9 +5,9 @@ cities.csv   a row per city, and one of all, with 95 % confidence intervals, and
              error of the valid pixels (``median_px``; what is beyond 16 px counts as 16)
 strata.csv   a row per stratum (see :mod:`.strata`), with confidence intervals
 scores.json  all of it but the tiles, with settings, time and memory, what makes the results
-             doubtful (see :mod:`.doubts`), why rows have no intervals (``no_interval``), and
-             of methods that state uncertainties what :mod:`.confidence` says of them by stratum
-cumulative.csv  the distribution of errors (see :mod:`.cumulative`)
+             doubtful (see :class:`.scores.Doubts`), why rows have no intervals (``no_interval``),
+             and of methods that state uncertainties what :mod:`.confidence` says by stratum
+cumulative.csv  the distribution of errors (see :class:`.scores.Cumulative`)
 sparsification.csv  of such methods: mean errors by the share of pixels taken away
 panels/      pictures of tiles: left, right, truth, disparity, error
 """
@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +31,17 @@ from stereotruth.core.products.rasters import read_image
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
 from .confidence import SHARES, Confidence
-from .cumulative import Cumulative
-from .doubts import Doubts
 from .panels import Column, draw_columns
-from .prediction_files import read_prediction, read_record, read_uncertainty
+from .prediction_files import (
+    SUBMITTED,
+    hold_against,
+    read_prediction,
+    read_record,
+    read_uncertainty,
+)
 from .protocols import Protocol, pair_sha256, protocol_of
-from .scores import ALL, Collector, Scorer, Scores
+from .scores import ALL, Cumulative, Doubts, Scorer, Scores
 from .strata import Products, exact_truth, height_m_per_px, label_strata, layers_of
-from .submission import SUBMITTED, hold_against
 
 log = logging.getLogger("stereotruth")
 
@@ -58,107 +61,105 @@ class ScoringPlan:
     panels: int
     protocol: str | None = None
 
-    @property
-    def sampling(self) -> dict[str, int]:
-        """Of the intervals."""
-        return {"times": self.bootstrap, "seed": self.seed}
 
-
-@dataclass
 class _Sums:
-    """Sums over the pairs that are scored, by ``scorer`` and ``protocol``."""
+    """Sums over the pairs of a dataset that are scored by a protocol."""
 
-    dataset: StereoDataset
-    scorer: Scorer
-    protocol: Protocol
-    products: Products
-    collector: Collector
-    cumulative: Cumulative
-    doubts: Doubts
-    confidences: dict[str, Confidence] = field(default_factory=dict)
-    errors: dict[str, ErrorSum] = field(default_factory=dict)
-    scored: list[tuple[str, str]] = field(default_factory=list)  # pairs, digests of their truth
-
-    @classmethod
-    def of(cls, dataset: StereoDataset, protocol: Protocol, products: Products) -> _Sums:
-        """Of no pair yet."""
+    def __init__(self, dataset: StereoDataset, protocol: Protocol, products: Products) -> None:
+        self.dataset, self.protocol, self.products = dataset, protocol, products
         thresholds = protocol.thresholds_px
-        scorer = Scorer(dataset.disparity_range, thresholds, dataset.grows_with_height)
-        doubts = Doubts(dataset.disparity_range)
-        return cls(
-            dataset,
-            scorer,
-            protocol,
-            products,
-            Collector(thresholds),
-            Cumulative(thresholds),
-            doubts,
-        )
+        self.scorer = Scorer(dataset.disparity_range, thresholds, dataset.grows_with_height)
+        self.scores, self.cumulative = Scores(thresholds), Cumulative(thresholds)
+        self.doubts = Doubts(dataset.disparity_range)
+        self.confidences: dict[str, Confidence] = {}
+        self.errors: dict[str, ErrorSum] = {}  # by city, and of all
+        self.scored: list[tuple[str, str]] = []  # pairs, digests of their truth
 
     def add(
         self, pair: Pair, labels: np.ndarray, found: np.ndarray, sigma: np.ndarray | None
     ) -> np.ndarray:
         """Add a pair with disparities ``found`` and their uncertainty; the truth it is held to."""
         scorer, truth = self.scorer, labels
-        layers = layers_of(self.dataset, pair)
-        strata_of_labels = label_strata(pair, labels, self.products, layers)
-        exact_of_pair = exact_truth(pair, self.products)
+        strata = label_strata(pair, labels, self.products, layers_of(self.dataset, pair))
+        exact = exact_truth(pair, self.products)
         truths = [labels]
         if self.protocol.truth == "exact":
-            truth = _visible(pair, exact_of_pair)
-            truths = [truth, *exact_of_pair.values()]
+            if not exact:
+                raise InputError(
+                    f"pair {pair.name} has no exact truth, by which its protocol scores",
+                    file=pair.left,
+                    remedy="take the workflow's own dataset of synthetic cities, or another "
+                    "protocol",
+                )
+            truth = exact["exact_visible"]
+            truths = [truth, *exact.values()]
         self.scored.append((pair.name, pair_sha256(pair, truths)))
         here = scorer.counted(truth)
         self.doubts.add(found, np.where(here, truth, np.nan))
         self.cumulative.add(np.abs(scorer.filled(found)[here] - truth[here].astype(np.float64)))
-        sums = scorer.sums(found, truth, strata_of_labels)
-        for stratum, exact in exact_of_pair.items():
-            sums[stratum] = scorer.sums(found, exact)[ALL]
+        sums = scorer.sums(found, truth, strata)
+        sums |= {stratum: scorer.sums(found, of)[ALL] for stratum, of in exact.items()}
+        self.scores.add(pair.name, pair.city, sums)
         error = (found - truth)[here]
         for place in (pair.city, ALL):
             self.errors.setdefault(place, ErrorSum()).add(error[np.isfinite(error)])
         if sigma is not None:
-            by_stratum = {
-                ALL: truth,
-                **{name: np.where(of, truth, np.nan) for name, of in strata_of_labels.items()},
-                **exact_of_pair,
-            }
-            for stratum, exact in by_stratum.items():
-                counted = np.where(scorer.counted(exact), exact, np.nan)
+            within = {name: np.where(of, truth, np.nan) for name, of in strata.items()}
+            for stratum, of in {ALL: truth, **within, **exact}.items():
+                counted = np.where(scorer.counted(of), of, np.nan)
                 self.confidences.setdefault(stratum, Confidence()).add(found, sigma, counted)
-        self.collector.add(pair.name, pair.city, sums)
         return truth
 
-    def rows(self, sampling: Mapping[str, int]) -> dict[str, Any]:
+    def rows(self, plan: ScoringPlan) -> dict[str, Any]:
         """Rows ``all``, ``cities``, ``strata`` with intervals by samples of the tiles."""
-        scores = self.collector.scores()
-        medians = {place: of.figures()["median_absolute"] for place, of in self.errors.items()}
-        cities = [
-            _row(scores, {"city": city}, sampling, scores.in_city(city))
-            | {"median_px": medians[city]}
-            for city in _cities(scores)
-        ]
+        scores = self.scores
+        cities = [city for _, city, _ in scores.tiles]
+        counts = {city: cities.count(city) for city in sorted(set(cities))} | {ALL: len(cities)}
+
+        def row(name: Mapping[str, str], city: str | None = None, stratum: str = ALL) -> dict:
+            found: dict[str, Any] = {**name, "tiles": counts[city or ALL]}
+            intervals = scores.intervals(plan.bootstrap, plan.seed, city, stratum)
+            for key, value in scores.row(city, stratum).items():
+                found[key] = value
+                if key in intervals:
+                    found[f"{key}_low"], found[f"{key}_high"] = intervals[key] or (None, None)
+            return found | {"no_interval": scores.no_interval(plan.bootstrap, city, stratum)}
+
+        by_city = {
+            city: row({"city": city}, None if city == ALL else city)
+            | {"median_px": self.errors[city].figures()["median_absolute"]}
+            for city in counts
+        }
         strata = [
-            _row(scores, {"stratum": name}, sampling, stratum=name)
+            row({"stratum": name}, stratum=name)
             for name in scores.strata
             if scores.row(stratum=name)["labelled"]
         ]
-        total = _row(scores, {"city": ALL}, sampling) | {"median_px": medians[ALL]}
-        return {"all": total, "cities": cities, "strata": strata}
+        return {"all": by_city.pop(ALL), "cities": list(by_city.values()), "strata": strata}
 
-    def write_tables(self, folder: Path, rows: Mapping[str, Any], pairs: Sequence[Pair]) -> None:
+    def write_tables(self, folder: Path, rows: Mapping[str, Any]) -> None:
         """All CSV files."""
-        scores = self.collector.scores()
         tiles = [
-            {"tile": pair.name, "city": pair.city, **scores.row(_only(len(pairs), n))}
-            for n, pair in enumerate(pairs)
+            {"tile": tile, "city": city, **self.scores.figures(sums[ALL])}
+            for tile, city, sums in self.scores.tiles
         ]
         write_table(folder / "scores.csv", tiles)
         write_table(folder / "cities.csv", [*rows["cities"], rows["all"]])
         write_table(folder / "strata.csv", rows["strata"])
         write_table(folder / "cumulative.csv", self.cumulative.rows())
+        curves = [
+            {
+                "stratum": stratum,
+                "removed_share": round(float(share), 2),
+                "epe_px": round(float(stated), 6),
+                "oracle_epe_px": round(float(oracle), 6),
+            }
+            for stratum, of in self.confidences.items()
+            if of.count
+            for share, stated, oracle in zip(SHARES, *of.curves())
+        ]
         if self.confidences:
-            write_table(folder / "sparsification.csv", _sparsification(self.confidences))
+            write_table(folder / "sparsification.csv", curves)
 
 
 def score(
@@ -184,7 +185,7 @@ def score(
     pairs = dataset.pairs(split, labelled=True)
     products = products or Products()
     record = read_record(predictions)
-    sums = _Sums.of(dataset, protocol, products)
+    sums = _Sums(dataset, protocol, products)
     drawn = {pair.name for pair in choose(pairs, plan.panels)}
     with atomic_folder(out) as scratch:
         for pair in progress(pairs, len(pairs), f"{label}: pairs scored"):
@@ -193,11 +194,10 @@ def score(
             truth = sums.add(pair, labels, found, read_uncertainty(predictions, pair))
             if pair.name in drawn:
                 shown = np.where(sums.scorer.counted(truth), truth, np.float32(np.nan))
-                column = Column(
-                    pair.name, read_image(pair.left), read_image(pair.right), shown, {label: found}
-                )
+                images = read_image(pair.left), read_image(pair.right)
+                column = Column(pair.name, *images, shown, {label: found})
                 draw_columns(scratch / "panels" / f"{pair.name}.png", [column], across=True)
-        rows = sums.rows(plan.sampling)
+        rows = sums.rows(plan)
         confidences = sums.confidences.items()
         summary = {
             "label": label,
@@ -215,7 +215,7 @@ def score(
         }
         if SUBMITTED in record:
             hold_against(record[SUBMITTED], summary)
-        sums.write_tables(scratch, rows, pairs)
+        sums.write_tables(scratch, rows)
         text = json.dumps(summary, indent=2) + "\n"
         (scratch / "scores.json").write_text(text, encoding="utf-8")
     log.info("%s: %s", label, describe(summary))
@@ -252,60 +252,9 @@ def choose(pairs: Sequence[Pair], most: int) -> list[Pair]:
         count[city] += 1
     chosen = []
     for city, of in by_city.items():
-        index = np.linspace(0, len(of) - 1, count[city] + 2)[1:-1] if count[city] < len(of) else ()
-        chosen += [of[round(k)] for k in index] if len(index) else (of if count[city] else [])
+        if count[city] == len(of):
+            chosen += of
+        else:
+            places = np.linspace(0, len(of) - 1, count[city] + 2)[1:-1]
+            chosen += [of[round(k)] for k in places]
     return chosen
-
-
-def _visible(pair: Pair, exact: Mapping[str, np.ndarray]) -> np.ndarray:
-    if not exact:
-        raise InputError(
-            f"pair {pair.name} has no exact truth, by which its protocol scores",
-            file=pair.left,
-            remedy="take the workflow's own dataset of synthetic cities, or another protocol",
-        )
-    return exact["exact_visible"]
-
-
-def _cities(scores: Scores) -> list[str]:
-    return list(dict.fromkeys(sorted(scores.cities)))
-
-
-def _only(count: int, index: int) -> np.ndarray:
-    return np.arange(count) == index
-
-
-def _sparsification(confidences: Mapping[str, Confidence]) -> list[dict[str, Any]]:
-    return [
-        {
-            "stratum": stratum,
-            "removed_share": round(float(share), 2),
-            "epe_px": round(float(stated), 6),
-            "oracle_epe_px": round(float(oracle), 6),
-        }
-        for stratum, of in confidences.items()
-        if of.count
-        for share, stated, oracle in zip(SHARES, *of.curves())
-    ]
-
-
-def _row(
-    scores: Scores,
-    name: Mapping[str, str],
-    sampling: Mapping[str, int],
-    where: Any = None,
-    stratum: str = ALL,
-) -> dict[str, Any]:
-    """Figures and intervals (``…_low``, ``…_high``) of the chosen tiles."""
-    figures = scores.row(where, stratum)
-    row: dict[str, Any] = {
-        **name,
-        "tiles": int(len(scores.tiles) if where is None else where.sum()),
-    }
-    intervals = scores.intervals(**sampling, where=where, stratum=stratum)
-    for key, value in figures.items():
-        row[key] = value
-        if key in intervals:
-            row[f"{key}_low"], row[f"{key}_high"] = intervals[key] or (None, None)
-    row["no_interval"] = scores.no_interval(sampling["times"], where, stratum)
-    return row

@@ -1,4 +1,4 @@
-"""The methods of a dataset side by side: tables 5, 6 and 7 of the paper, and one by strata.
+"""The methods of a dataset side by side: tables 5, 6 and 7 of the paper, and others beside them.
 
 Made from the ``scores.json`` of each method. Figures are those of all labelled pixels, holes
 filled, so that methods with and without holes compare; those of the valid pixels alone stand beside
@@ -11,42 +11,42 @@ there is one.
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from stereotruth.core.errors import InputError, in_number
-from stereotruth.core.products.files import atomic_file, write_table
-from stereotruth.pages.tables import Cell, Column, metres, minus
+import numpy as np
+
+from stereotruth.core.errors import in_number
+from stereotruth.core.products.files import atomic_file, read_table, write_table
+from stereotruth.pages.tables import EMPTY, Cell, Column, metres, minus
 from stereotruth.pages.tables import Table as Shown
 
 from ..methods.kinds import KINDS
-from . import published_scores
-from .training_data import COLUMNS as TRAINING
-from .training_data import training_data
+from .published import TABLE5, TABLE6, TABLE7, training_data
+from .published import TRAINING_COLUMNS as TRAINING
+from .scores import CONFIDENCE, MIN_TILES, Floats, resampled
 
-Row = dict[str, Any]
+Row = Mapping[str, Any]
 
 
-PAPERS = "The paper's, on the real WHU-Stereo"
+PAPERS = "The paper's, on the real WHU-Stereo."
 FILLED = "all labelled pixels, holes filled"
-NOTHING = Cell("–", "")
 
 
 @dataclass(frozen=True)
 class Table:
     """Rows for a CSV file, and one or more tables with captions to read, in Markdown or on a page.
 
-    Captions may have Markdown's marks of code.
+    Captions may have Markdown's marks of code. No table is shown (None) of no rows.
     """
 
     name: str
     title: str
     rows: Sequence[Row]
-    shown: Sequence[tuple[str, Shown]]
+    shown: Sequence[tuple[str, Shown | None]]
     also: str = ""  # what the paper calls it
     protocol: str = ""  # id of that by which the scores are made
 
@@ -65,6 +65,9 @@ class Table:
         more = "".join(f" ({text})" for text in (self.also, self.protocol) if text)
         parts = [f"# {self.title}{more}"]
         for caption, shown in self.shown:
+            parts.append(caption)
+            if shown is None:
+                continue
             lines = [
                 [column.title for column in shown.columns],
                 ["---:" if column.numeric else "---" for column in shown.columns],
@@ -73,34 +76,46 @@ class Table:
                 if heading:
                     lines.append([f"**{heading}**", *[""] * (len(shown.columns) - 1)])
                 lines += [[f"**{c.text}**" if c.best else c.text for c in row] for row in rows]
-            parts.append(caption)
             parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
         return "\n\n".join(parts) + "\n"
+
+    def write(self, folder: str | Path) -> None:
+        """Write ``<name>.csv`` and ``<name>.md``."""
+        write_table(Path(folder) / f"{self.name}.csv", self.rows, self.columns)
+        with atomic_file(Path(folder) / f"{self.name}.md") as scratch:
+            scratch.write_text(self.markdown(), encoding="utf-8")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """How a figure of the scores is shown: title, key, factor, format, whether more is better."""
+    """How a figure of the scores is shown: title, key, factor, format, whether more is better.
+
+    ``interval``: whether it stands with its interval even where it is not the best.
+    """
 
     title: str
     key: str
     factor: float = 1
     form: str = ".3f"
     more: bool = False
+    interval: bool = False
 
-    def cell(
-        self, row: Row, best: float | None, *, interval: bool = False, line: str = " "
-    ) -> Cell:
-        """The figure of a row; ``best`` of all rows, which stands with its interval.
+    def text(self, row: Row, *, interval: bool = True, line: str = " ") -> str:
+        """The figure of a row and, if wanted and known, its interval after ``line``."""
+        text = format(self.factor * row[self.key], self.form)
+        ends = [row.get(f"{self.key}_{end}") for end in ("low", "high")]
+        if interval and None not in ends:
+            text += f"{line}[{', '.join(format(self.factor * v, self.form) for v in ends)}]"
+        return text
 
-        ``line``: what stands between both.
-        """
+    def cell(self, row: Row, best: float | None = None, line: str = " ") -> Cell:
+        """The figure of a row; ``best`` of all rows, which is bold and has its interval."""
         value = row.get(self.key)
         if value is None:
-            return NOTHING
+            return EMPTY
         is_best = best is not None and value == best
-        text = with_interval(row, self.key, self.factor, self.form, shown=interval or is_best)
-        return Cell(minus(text.replace(" ", line, 1)), f"{value:.9g}", best=is_best)
+        text = self.text(row, interval=self.interval or is_best, line=line)
+        return Cell(minus(text), f"{value:.9g}", best=is_best)
 
     def best(self, rows: Sequence[Row]) -> float | None:
         """The best of at least two values."""
@@ -110,120 +125,85 @@ class Figure:
         return max(values) if self.more else min(values)
 
 
-def plain_table(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> Shown:
-    """A table of texts, sorted by the numbers that they begin with; words stand in the first."""
-    numeric = [
-        column > 0 and all(_leading(line[column]) is not None for line in lines)
-        for column in range(len(heading))
-    ]
+def of_figures(
+    rows: Sequence[Row],
+    names: Mapping[str, str],
+    figures: Sequence[Figure],
+    more: Mapping[str, str] | None = None,
+) -> Shown | None:
+    """A table of rows: ``names`` in words, figures of which none is bold, ``more`` words.
 
-    def cell(column: int, text: str) -> Cell:
-        number = _leading(text)
-        return Cell(minus(text) if column else text, text if number is None else number)
-
-    rows = tuple(tuple(cell(k, text) for k, text in enumerate(line)) for line in lines)
-    return Shown(tuple(map(Column, heading, numeric)), (("", rows),) if rows else ())
-
-
-def nothing(name: str, title: str, why: str) -> Table:
-    """A table without rows; ``why`` there are none."""
-    return Table(name, title, [], [(why, plain_table(["Method"], []))])
-
-
-def _leading(text: str) -> str | None:
-    """The number that a text begins with; empty of a dash, None of words."""
-    if text == "–":
-        return ""
-    begins = re.match(r"[+-]?\d+(\.\d+)?(?=$|\s)", text)
-    return begins[0].lstrip("+") if begins else None
-
-
-def read_scores(folders: Iterable[str | Path]) -> list[Row]:
-    """The summaries of methods, from their folders. Raises InputError if one has none."""
-    found = []
-    for folder in folders:
-        file = Path(folder) / "scores.json"
-        if not file.is_file():
-            raise InputError("no scores", file=file, remedy="run benchmark/<dataset>/<method>")
-        found.append(json.loads(file.read_text(encoding="utf-8")))
-    return found
-
-
-def make_tables(
-    methods: Sequence[Row], trained: Iterable[str], *, beside_paper: bool
-) -> list[Table]:
-    """Tables 5, 6, 7 and the one by strata.
-
-    ``methods``: summaries of one dataset, in the order of the configuration; ``trained``: cities
-    that have training tiles; ``beside_paper``: whether the paper's figures are of these cities.
+    The words by the key in a row and the title of their column. None of no rows.
     """
-    trained = set(trained)
-    return [
-        of_methods(methods, beside_paper=beside_paper),
-        by_city(methods, trained, beside_paper=beside_paper),
-        of_fine_tuned(methods, trained, beside_paper=beside_paper),
-        by_strata(methods),
+    words = [tuple(Cell(row[key], row[key]) for key in names) for row in rows]
+    after = [tuple(Cell(row[key], row[key]) for key in more or ()) for row in rows]
+    lines = [
+        (*first, *(figure.cell(row) for figure in figures), *last)
+        for row, first, last in zip(rows, words, after)
     ]
+    titles = [*names.values(), *(figure.title for figure in figures), *(more or {}).values()]
+    is_text = [k for k in range(len(titles)) if not 0 <= k - len(names) < len(figures)]
+    return Shown.of(titles, lines, is_text)
 
 
-def write_tables(tables: Iterable[Table], folder: str | Path) -> None:
-    """``<name>.csv`` and ``<name>.md`` of each."""
-    for table in tables:
-        write_table(Path(folder) / f"{table.name}.csv", table.rows, table.columns)
-        with atomic_file(Path(folder) / f"{table.name}.md") as scratch:
-            scratch.write_text(table.markdown(), encoding="utf-8")
+# ------------------------------------------------------------------- tables 5, 6, 7 and by strata
 
 
 def of_methods(methods: Sequence[Row], *, beside_paper: bool) -> Table:
-    """Accuracy, completeness, time and memory of the methods over all tiles."""
+    """Accuracy, completeness, time and memory of the methods over all tiles: table 5.
+
+    ``methods``: summaries of one dataset, in the order of the configuration, here as in the other
+    tables; ``beside_paper``: whether the paper's figures are of these cities.
+    """
     rows = []
     for of in methods:
         row = {
             "method": of["label"],
             "kind": of["settings"]["kind"],
             **{key: value for key, value in of["all"].items() if key != "city"},
-            "median_seconds": of["median_seconds"],
-            "peak_memory_mb": of["peak_memory_mb"],
-            "device": of["device"],
-            "threads": of["threads"],
+            **{key: of[key] for key in ("median_seconds", "peak_memory_mb", "device", "threads")},
             **training_data(of),
         }
-        published = published_scores.TABLE5.get(_kind(of)) if beside_paper else None
+        published = TABLE5.get(_kind(of)) if beside_paper else None
         if published and not of["fine_tuned_of"]:
-            keys = ("paper_epe_px", "paper_d1_percent", "paper_ms")
-            row |= dict(zip(keys, published))
+            row |= dict(zip(("paper_epe_px", "paper_d1_percent", "paper_ms"), published))
         rows.append(row)
     caption = (
         f"Ours: {FILLED}, with 95 % confidence; then valid pixels only. {dataset_in_words(methods)}"
     )
     shown = [(caption, _accuracy(rows, methods))]
-    if beside_paper:
-        kinds = dict.fromkeys(_kind(of) for of in _plain(methods))
-        shown += _published(
-            ["Method", "EPE (px)", "D1 (%)", "Time (ms)"],
-            [
-                [
-                    KINDS[kind].label,
-                    *_paper(published_scores.TABLE5[kind][:2]),
-                    f"{published_scores.TABLE5[kind][2]}",
-                ]
-                for kind in kinds
-                if kind in published_scores.TABLE5
-            ],
-        )
+    kinds = dict.fromkeys(_kind(of) for of in methods if not of["fine_tuned_of"])
+    figures = [
+        Figure("EPE (px)", "0"),
+        Figure("D1 (%)", "1", 1, ".2f"),
+        Figure("Time (ms)", "2", 1, ".0f"),
+    ]
+    theirs = [
+        {"method": KINDS[kind].label, **{str(k): v for k, v in enumerate(TABLE5[kind])}}
+        for kind in kinds
+        if kind in TABLE5
+    ]
+    if beside_paper and theirs:
+        shown.append((PAPERS, of_figures(theirs, {"method": "Method"}, figures)))
     return Table("methods", "Accuracy, time and memory", rows, shown, "table 5 of the paper")
+
+
+def error_figures(methods: Sequence[Row]) -> list[Figure]:
+    """EPE, and D1 at each threshold."""
+    limits = methods[0]["thresholds_px"] if methods else [3.0]
+    return [
+        Figure("EPE, px", "filled_epe_px"),
+        *(Figure(f"> {v:g} px, %", f"filled_d1_{v:g}_px_share", 100, ".2f") for v in limits),
+    ]
 
 
 def _accuracy(rows: Sequence[Row], methods: Sequence[Row]) -> Shown:
     """A row per method."""
-    limits = methods[0]["thresholds_px"] if methods else [3.0]
-    first = limits[0]
+    errors = error_figures(methods)
+    first = methods[0]["thresholds_px"][0] if methods else 3.0
     figures = [
-        Figure("EPE, px", "filled_epe_px"),
-        *(
-            Figure(f"> {limit:g} px, %", f"filled_d1_{limit:g}_px_share", 100, ".2f")
-            for limit in limits
-        ),
+        *(replace(figure, interval=True) for figure in errors[:2]),
+        *errors[2:],
         Figure("valid only: median, px", "median_px"),
         Figure("valid only: EPE, px", "epe_px"),
         Figure(f"valid only: > {first:g} px, %", f"d1_{first:g}_px_share", 100, ".2f"),
@@ -232,12 +212,13 @@ def _accuracy(rows: Sequence[Row], methods: Sequence[Row]) -> Shown:
         Figure("memory, MB", "peak_memory_mb", 1, ".0f"),
     ]
     best = [figure.best(rows) for figure in figures]
+    titles = [figure.title for figure in figures]
     heights = [of.get("height_m_per_px") for of in methods]
+    if any(heights):
+        titles.insert(1, "EPE, m of height")
     lines = []
     for row, height in zip(rows, heights):
-        cells = [
-            figure.cell(row, b, interval=k < 2) for k, (figure, b) in enumerate(zip(figures, best))
-        ]
+        cells = [figure.cell(row, b) for figure, b in zip(figures, best)]
         epe = row.get("filled_epe_px")
         if any(heights):
             known = epe is not None and height is not None
@@ -245,9 +226,6 @@ def _accuracy(rows: Sequence[Row], methods: Sequence[Row]) -> Shown:
             cells.insert(1, Cell(text, f"{epe * height:.9g}" if known else "", best=cells[0].best))
         cells += [Cell(row[key], row[key]) for key in TRAINING]
         lines.append((Cell(row["method"], row["method"]), *cells))
-    titles = [figure.title for figure in figures]
-    if any(heights):
-        titles.insert(1, "EPE, m of height")
     columns = (
         Column("method", False),
         *(Column(title, True) for title in titles),
@@ -259,13 +237,9 @@ def _accuracy(rows: Sequence[Row], methods: Sequence[Row]) -> Shown:
 def _by_method(rows: Sequence[Row], name: str, methods: Sequence[Row]) -> Shown:
     """A row per city or stratum, columns for each method; a group's own row stands last in it."""
     labels = [of["label"] for of in methods]
-    figures = [Figure("EPE, px", "filled_epe_px")]
-    if methods:
-        limit = methods[0]["thresholds_px"][0]
-        figures.append(Figure(f"> {limit:g} px, %", f"filled_d1_{limit:g}_px_share", 100, ".2f"))
-    groups = list(dict.fromkeys(row.get("group", "") for row in rows))
+    figures = error_figures(methods)[:2]
     found = []
-    for group in groups:
+    for group in dict.fromkeys(row.get("group", "") for row in rows):
         here = [row for row in rows if row.get("group", "") == group]
         lines = []
         for value in dict.fromkeys(row[name] for row in here):
@@ -285,13 +259,30 @@ def _by_method(rows: Sequence[Row], name: str, methods: Sequence[Row]) -> Shown:
     return Shown(columns, tuple(found))
 
 
-def by_city(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
-    """Scores by city: generalisation within cities, extrapolation to others."""
+def by_strata(methods: Sequence[Row]) -> Table:
+    """Where the methods differ."""
+    names = list(dict.fromkeys(row["stratum"] for of in methods for row in of["strata"]))
+    rows = [
+        {"method": of["label"], **row}
+        for name in names
+        for of in methods
+        for row in of["strata"]
+        if row["stratum"] == name
+    ]
+    caption = f"EPE and D1 ({FILLED}) by what the pixels show"
+    shown = [(caption, _by_method(rows, "stratum", methods))]
+    return Table("strata", "Scores by what the pixels show", rows, shown)
+
+
+def by_city(methods: Sequence[Row], trained: Iterable[str], *, beside_paper: bool) -> Table:
+    """Scores by city, those with training tiles (``trained``) first: generalisation within cities,
+    extrapolation to others."""
     table = Table("by_city", "Accuracy by city", [], [], "table 6 of the paper")
-    return _by_city(table, _plain(methods), trained, beside_paper=beside_paper)
+    plain = [of for of in methods if not of["fine_tuned_of"]]
+    return _by_city(table, plain, set(trained), beside_paper=beside_paper)
 
 
-def of_fine_tuned(methods: Sequence[Row], trained: set[str], *, beside_paper: bool) -> Table:
+def of_fine_tuned(methods: Sequence[Row], trained: Iterable[str], *, beside_paper: bool) -> Table:
     """Fine-tuned methods by city, beside the same methods trained on this dataset alone."""
     table = Table("fine_tuned", "Fine-tuned methods by city", [], [], "table 7 of the paper")
     by_name = {of["method"]: of for of in methods}
@@ -304,23 +295,8 @@ def of_fine_tuned(methods: Sequence[Row], trained: set[str], *, beside_paper: bo
             columns.append(of)
     if not columns:
         text = "No method of the configuration has `fine_tuned_of`."
-        return nothing(table.name, table.title, text)
-    return _by_city(table, columns, trained, beside_paper=beside_paper)
-
-
-def by_strata(methods: Sequence[Row]) -> Table:
-    """Where the methods differ."""
-    names = list(dict.fromkeys(row["stratum"] for of in methods for row in of["strata"]))
-    found = {of["method"]: {row["stratum"]: row for row in of["strata"]} for of in methods}
-    rows = [
-        {"method": of["label"], **found[of["method"]][name]}
-        for name in names
-        for of in methods
-        if name in found[of["method"]]
-    ]
-    caption = f"EPE and D1 ({FILLED}) by what the pixels show"
-    shown = [(caption, _by_method(rows, "stratum", methods))]
-    return Table("strata", "Scores by what the pixels show", rows, shown)
+        return replace(table, shown=[(text, None)], also="")
+    return _by_city(table, columns, set(trained), beside_paper=beside_paper)
 
 
 def _by_city(
@@ -332,92 +308,61 @@ def _by_city(
         ("cities with training tiles", [city for city in cities if city in trained]),
         ("cities without", [city for city in cities if city not in trained]),
     ]
-    rows = []
+    rows: list[Row] = []
     for group, members in groups:
         for city in members:
             for of in methods:
-                row = {"city": city, "group": group, "method": of["label"], **_city(of, city)}
+                found = next((row for row in of["cities"] if row["city"] == city), {})
+                row = {"city": city, "group": group, "method": of["label"]}
+                row |= {key: value for key, value in found.items() if key != "city"}
                 if beside_paper and (values := _published_of(of, city)):
                     row |= dict(zip(("paper_epe_px", "paper_d1_percent"), values))
                 rows.append(row)
         if len(members) > 1:
-            pooled = [_pooled(of, members) for of in methods]
-            rows += [
-                {"city": "all of group", "group": group, "method": of["label"], **row}
-                for of, row in zip(methods, pooled)
-            ]
+            start = {"city": "all of group", "group": group}
+            rows += [start | {"method": of["label"], **_pooled(of, members)} for of in methods]
     caption = f"Ours: EPE and D1 of {FILLED}. {dataset_in_words(methods)}"
-    shown = [(caption, _by_method(rows, "city", methods))]
-    if beside_paper:
-        there: dict[tuple[str, bool], Row] = {}  # several methods here may be of one there
-        for of in methods:
-            there.setdefault((_kind(of), bool(of["fine_tuned_of"])), of)
-        known = []
-        for city in cities:
-            values = [_published_of(of, city) for of in there.values()]
-            if any(values):
-                known.append([city, *(text for of in values for text in _paper(of))])
-        shown += _published(_heading("City", list(there.values())), known)
+    shown: list[tuple[str, Shown | None]] = [(caption, _by_method(rows, "city", methods))]
+    there: dict[tuple[str, bool], Row] = {}  # several methods here may be of one there
+    for of in methods:
+        there.setdefault((_kind(of), bool(of["fine_tuned_of"])), of)
+    theirs = [
+        {"city": city}
+        | {str(k): v for k, v in enumerate(v for pair in values for v in pair or (None, None))}
+        for city in cities
+        if any(values := [_published_of(of, city) for of in there.values()])
+    ]
+    if beside_paper and theirs:
+        figures = [
+            figure
+            for k, of in enumerate(there.values())
+            for figure in (
+                Figure(f"{of['label']}: EPE (px)", f"{2 * k}"),
+                Figure("D1 (%)", f"{2 * k + 1}", 1, ".2f"),
+            )
+        ]
+        shown.append((PAPERS, of_figures(theirs, {"city": "City"}, figures)))
     return replace(table, rows=rows, shown=shown)
 
 
 def _published_of(of: Row, city: str) -> tuple[float, float] | None:
     """The paper's EPE and D1 of a kind of method in a city: table 7 of fine-tuned ones, else 6."""
-    table = published_scores.TABLE7 if of["fine_tuned_of"] else published_scores.TABLE6
-    return table.get(city, {}).get(_kind(of))
-
-
-def _published(heading: Sequence[str], lines: Sequence[Sequence[str]]) -> list[tuple[str, Shown]]:
-    return [(f"{PAPERS}.", plain_table(heading, lines))] if lines else []
-
-
-def _paper(values: Sequence[float] | None) -> tuple[str, str]:
-    """EPE and D1 as the paper prints them."""
-    return ("–", "–") if values is None else (f"{values[0]:.3f}", f"{values[1]:.2f}")
-
-
-def _heading(first: str, methods: Sequence[Row]) -> list[str]:
-    pairs = ((f"{of['label']}: EPE (px)", "D1 (%)") for of in methods)
-    return [first, *(name for pair in pairs for name in pair)]
-
-
-def _plain(methods: Sequence[Row]) -> list[Row]:
-    """The methods that are not fine-tuned."""
-    return [of for of in methods if not of["fine_tuned_of"]]
+    return (TABLE7 if of["fine_tuned_of"] else TABLE6).get(city, {}).get(_kind(of))
 
 
 def _kind(of: Row) -> str:
     return of["settings"]["kind"]
 
 
-def _city(of: Row, city: str) -> Row:
-    found = (row for row in of["cities"] if row["city"] == city)
-    return {key: value for key, value in next(found, {}).items() if key != "city"}
-
-
-def _pooled(of: Row, cities: Sequence[str]) -> Row:
+def _pooled(of: Row, cities: Sequence[str]) -> dict[str, Any]:
     """Figures of all labelled pixels of some cities, of those of each."""
     rows = [row for row in of["cities"] if row["city"] in cities]
     labelled = sum(row["labelled"] for row in rows)
-    keys = ["filled_epe_px", *(f"filled_d1_{limit:g}_px_share" for limit in of["thresholds_px"])]
-    found: Row = {"tiles": sum(row["tiles"] for row in rows), "labelled": labelled}
-    for key in keys:
+    found = {"tiles": sum(row["tiles"] for row in rows), "labelled": labelled}
+    for key in (figure.key for figure in error_figures([of])):
         total = sum(row["labelled"] * row[key] for row in rows if row["labelled"])
         found[key] = round(total / labelled, 6) if labelled else None
     return found
-
-
-def with_interval(row: Row, key: str, factor: float, form: str, *, shown: bool = True) -> str:
-    """A figure and, where there is one and it is to be shown, its interval."""
-    text = _number(row.get(key), factor, form)
-    ends = [row.get(f"{key}_{end}") for end in ("low", "high")]
-    if shown and None not in ends:
-        text += f" [{', '.join(_number(end, factor, form) for end in ends)}]"
-    return text
-
-
-def _number(value: float | None, factor: float, form: str) -> str:
-    return "–" if value is None else format(factor * value, form)
 
 
 def dataset_in_words(methods: Sequence[Row]) -> str:
@@ -434,3 +379,79 @@ def dataset_in_words(methods: Sequence[Row]) -> str:
         f"disparities [{low}, {high}) px."
     )
     return where + more
+
+
+# ------------------------------------------------------------------- methods on the same tiles
+
+
+def difference(
+    first: Mapping[str, Floats], second: Mapping[str, Floats], times: int, seed: int
+) -> dict[str, Any]:
+    """Second less first over the tiles that both have, and its 95 % interval.
+
+    By tile: labelled pixels, and a figure's sum over them. Both are resampled together, so that
+    what is hard in a tile for both cancels. No interval (None) of fewer than ``MIN_TILES`` tiles;
+    ``better_share``: of the tiles on which the second has the smaller figure.
+    """
+    tiles = [name for name in first if name in second]
+    found: dict[str, Any] = dict.fromkeys(("value", "low", "high", "better_share"))
+    if tiles:
+        sums = np.array([[*first[name], *second[name]] for name in tiles])
+
+        def pooled(total: Floats) -> Floats:
+            return total[..., 3] / total[..., 2] - total[..., 1] / total[..., 0]
+
+        found["value"] = float(pooled(sums.sum(axis=0)))
+        found["better_share"] = float((pooled(sums) < 0).mean())
+        if len(tiles) >= MIN_TILES and times:
+            samples = pooled(resampled(sums, times, seed))
+            found["low"], found["high"] = np.percentile(samples, CONFIDENCE).tolist()
+    rounded = {name: None if v is None else round(v, 6) for name, v in found.items()}
+    return {"tiles": len(tiles), **rounded}
+
+
+def differences(methods: Sequence[Row], folders: Sequence[str | Path], *, seed: int) -> Table:
+    """How much methods differ two by two on the same tiles.
+
+    Tiles differ more than methods do, so that intervals of single methods overlap even where one is
+    better on nearly every tile. ``folders``: of the methods, with ``scores.csv``; intervals come
+    from as many samples as those of the first method.
+    """
+    title = "Differences: method by method on the same tiles"
+    if len(methods) < 2:
+        return Table("differences", title, [], [("One method alone.", None)])
+    limit = methods[0]["thresholds_px"][0]
+    names = {"epe_px": "filled_epe_px", "d1_share": f"filled_d1_{limit:g}_px_share"}
+    tables = [
+        [row for row in read_table(Path(folder) / "scores.csv") if int(row["labelled"])]
+        for folder in folders
+    ]
+    sums = [
+        {
+            key: {row["tile"]: int(row["labelled"]) * np.array([1, float(row[name])]) for row in of}
+            for key, name in names.items()
+        }
+        for of in tables
+    ]
+    rows = []
+    for a, b in combinations(range(len(methods)), 2):
+        row: dict[str, Any] = {"method": methods[b]["label"], "less": methods[a]["label"]}
+        for key in names:
+            found = difference(sums[a][key], sums[b][key], methods[0]["bootstrap"], seed)
+            row |= {"tiles": found["tiles"], key: found["value"]}
+            row |= {f"{key}_{end}": found[end] for end in ("low", "high", "better_share")}
+        rows.append(row)
+    better = "better on (% of tiles)"
+    figures = [
+        Figure("EPE (px)", "epe_px", 1, "+.3f", interval=True),
+        Figure(better, "epe_px_better_share", 100, ".0f"),
+        Figure(f"D1, {limit:g} px (%)", "d1_share", 100, "+.2f", interval=True),
+        Figure(better, "d1_share_better_share", 100, ".0f"),
+    ]
+    named = [{"name": f"{row['method']} minus {row['less']}", **row} for row in rows]
+    caption = (
+        f"Difference of {FILLED}, with 95 % confidence by resampling the tiles of both methods "
+        "together: negative where the first of the two is better."
+    )
+    shown = of_figures(named, {"name": "Methods"}, figures)
+    return Table("differences", title, rows, [(caption, shown)])

@@ -20,7 +20,7 @@ from ..core.errors import InputError
 from ..core.numerics.geometry import corners_of_hull
 from ..core.products.rasters import open_raster
 from ..lidar.lattice import Footprint
-from ..sensor.pair_geometry import find_overlap, find_rotation
+from ..sensor.pair_geometry import find_overlap, find_rotation, frame, steps
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import read_rpc
 from .align import RPC_SHIFT, RPC_TILT

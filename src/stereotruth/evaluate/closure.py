@@ -5,23 +5,12 @@ C at once. Both places in C should be one. Their difference is given in px of th
 its rows: the disparity of A-C by way of B less its label.
 
 All three labels rest on one point cloud and, where the images are adjusted together, on one
-correction per image. Whatever the three corrections and the heights of the ground are, the rays
-that they define close: for one height h of a point, d_AB, d_BC and d_AC are its projections by the
-same three sensors. So neither the alignment's covariance nor the noise of the points has a part in
-a closure. What is left, and makes up its uncertainty, is
-
-- *reading*: labels of B-C and A-C are read between the centres of pixels, bilinearly, and each grid
-  samples the small facets of rough ground in its own way. Both errors grow with the second
-  differences of the labels around, and are as good as independent a few pixels on. Their size is
-  therefore the scatter of closures between pixels LAG apart, in units of these second differences,
-  by classes of like roughness;
-- the *epipolar models*: the y-parallax that each leaves, as its own check states;
-- the *alignment*, where an image has not one correction in all three pairs.
-
-An error that neighbours share is no part of the first: an offset of one pair, a correction that
-differs, an RPC that is not smooth. It shows as a closure beyond its uncertainty.
-How good the corrections are shows the closure of the pairs' own refinements, each of which rests on
-tie points of its own: see :func:`closure_of_refinements`.
+correction per image: neither the alignment's covariance nor the noise of the points has a part in
+a closure. What makes up its uncertainty is the *reading* of labels between the centres of pixels
+(:func:`_reading`), the y-parallax of the *epipolar models*, and the *alignment* where an image has
+not one correction in all three pairs. An error that neighbours share is no part of the first: an
+offset of one pair, a correction that differs, an RPC that is not smooth show as a closure beyond
+its uncertainty.
 """
 
 from __future__ import annotations
@@ -218,7 +207,9 @@ class _Triplet:
 def _reading(here: _Closures, beside: _Closures) -> Floats:
     """Standard uncertainty [n] px of closures by the reading of the labels.
 
-    In each class of like roughness the standard deviation of closure over roughness, from the
+    Each grid samples the small facets of rough ground in its own way: errors of reading grow with
+    the second differences of the labels around, and are as good as independent a few pixels on. So
+    in each class of like roughness it is the standard deviation of closure over roughness, from the
     differences of pixels LAG apart; none counts more than HEAVY of its usual size.
     """
     floor = np.finfo(np.float32).eps * FLOAT_PX

@@ -8,6 +8,7 @@ scene and tile, and drawn.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,22 +16,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.stats import binned_statistic_2d
 
+from ..core.errors import InputError
 from ..core.numerics.statistics import ErrorSum
 from ..core.products.files import read_table, write_table
-from ..core.products.grids import require_complete
+from ..core.products.grids import blocks, open_grid, require_complete
 from ..core.products.rasters import read_tile
-from ..epipolar.warping import CorrelationSum
+from ..epipolar.warping import CorrelationSum, agreement, warp_window
 from ..pages import pictures
 from ..tiles.label_surfaces import BUILDING, VEGETATION
 from ..tiles.manifest import Tile, read_manifest
 from ..tiles.sift_matches import GROSS_PX
 from ..tiles.tile_checks import warp_tile
-from .scene_warping import SceneWarping, warp_scene
 
 Floats = NDArray[np.float64]
 
 
+BLOCK = 1024  # px of a grid, that are read at once
 CELL_PX = 128  # of the maps of errors
 CELL_MATCHES = 3  # fewer give no median
 EXAMPLES = 3  # tiles in the figure of warped images
@@ -101,6 +104,44 @@ def read_matches(path: str | Path, tiles: Iterable[Tile]) -> Iterator[Matches]:
         )
 
 
+@dataclass
+class SceneWarping:
+    """Sums of left and warped right image, and counts of pixels: labelled, in the left image."""
+
+    sums: CorrelationSum = field(default_factory=CorrelationSum)
+    labelled: int = 0
+    imaged: int = 0
+
+    def merge(self, other: SceneWarping) -> None:
+        """Add those of other pixels."""
+        self.sums.merge(other.sums)
+        self.labelled += other.labelled
+        self.imaged += other.imaged
+
+
+def warp_scene(left: str | Path, right: str | Path, disparity: str | Path) -> SceneWarping:
+    """Warp a scene, given as left.zarr, right.zarr and disparity.zarr, block by block.
+
+    Raises InputError for unfinished stores.
+    """
+    left_image, right_image = (open_grid(path)["image"] for path in (left, right))
+    labels = open_grid(disparity)["disparity"]
+    if not left_image.shape == right_image.shape == labels.shape:
+        raise InputError(
+            "images and disparity differ in size", file=disparity, remedy="run project again"
+        )
+    total = SceneWarping()
+    for rows, cols in blocks(labels.shape, BLOCK):
+        values = labels[rows, cols].values.astype(np.float64)
+        warped = warp_window(right_image, values, rows, cols)
+        reference = left_image[rows, cols].values.astype(np.float64)
+        labelled = int(np.isfinite(values).sum())
+        total.merge(
+            SceneWarping(agreement(reference, warped), labelled, int((reference != 0).sum()))
+        )
+    return total
+
+
 def _mean(values: Sequence[float]) -> float | str:
     return round(float(np.mean(values)), 4) if values else ""
 
@@ -127,21 +168,11 @@ def table4_row(name: str, tiles: Sequence[Floats]) -> dict[str, Any]:
     return dict(zip(TABLE4, values))
 
 
-def _sift_row(scope: str, name: str, pairs: int, errors: ErrorSum) -> dict[str, Any]:
-    f = errors.figures()
-    keys = ("count", "bias", "mean_absolute", "median", "rms", "nmad")
-    return dict(zip(SIFT, (scope, name, pairs, *(f[key] for key in keys))))
-
-
-def _correlation(sums: CorrelationSum) -> float | str:
-    value = sums.coefficient
-    return round(value, 6) if np.isfinite(value) else ""
-
-
 def _warping_row(scope: str, name: str, warped: SceneWarping) -> dict[str, Any]:
     share = round(warped.labelled / max(warped.imaged, 1), 6)
-    values = (scope, name, "", share, warped.sums.count, _correlation(warped.sums))
-    return dict(zip(WARPING, values))
+    coefficient = warped.sums.coefficient
+    correlation = round(coefficient, 6) if np.isfinite(coefficient) else ""
+    return dict(zip(WARPING, (scope, name, "", share, warped.sums.count, correlation)))
 
 
 def evaluate_city(
@@ -184,34 +215,19 @@ def evaluate_city(
     order = ("city", "tiles of class", "key points on", "scene", "tile")
     table = [table4_row(f"{city} ({kind})", errors) for kind, errors in by_kind.items() if errors]
     write_table(table4, table, TABLE4)
-    write_table(
-        sift,
-        [
-            _sift_row(*key, pairs[key], sums[key])
-            for key in sorted(sums, key=lambda key: order.index(key[0]))
-        ],
-        SIFT,
-    )
+    sift_rows = []
+    for scope, name in sorted(sums, key=lambda key: order.index(key[0])):
+        of = sums[scope, name].figures()
+        keys = ("count", "bias", "mean_absolute", "median", "rms", "nmad")
+        values = (scope, name, pairs[scope, name], *(of[key] for key in keys))
+        sift_rows.append(dict(zip(SIFT, values)))
+    write_table(sift, sift_rows, SIFT)
     by_scene = {scene: warp_scene(*stores) for scene, stores in scenes.items()}
     whole = SceneWarping()
     for warped in by_scene.values():
         whole.merge(warped)
-    tile_rows = [
-        dict(
-            zip(
-                WARPING,
-                (
-                    "tile",
-                    row["tile"],
-                    row["class"],
-                    row["labelled_share"],
-                    row["count_labelled"],
-                    row["warp_correlation"],
-                ),
-            )
-        )
-        for row in rows
-    ]
+    columns = ("tile", "class", "labelled_share", "count_labelled", "warp_correlation")
+    tile_rows = [dict(zip(WARPING, ("tile", *(row[name] for name in columns)))) for row in rows]
     scene_rows = [_warping_row("scene", scene, warped) for scene, warped in by_scene.items()]
     write_table(warping, [_warping_row("city", city, whole), *scene_rows, *tile_rows], WARPING)
     _draw_sift(Path(sift_figure), city, by_kind, maps)
@@ -233,19 +249,14 @@ class _Map:
 
     def medians(self) -> tuple[Floats, Floats]:
         """Median error and y-parallax (px) in cells of ``CELL_PX``, NaN for a few matches."""
-        cells = tuple(-(-size // CELL_PX) for size in self.shape)
-        x, y, *values = np.hstack([np.empty((4, 0), np.float32), *self.parts])
-        cell = (y // CELL_PX).astype(np.intp) * cells[1] + (x // CELL_PX).astype(np.intp)
-        order = np.argsort(cell, kind="stable")
-        numbers, first = np.unique(cell[order], return_index=True)
-        maps = []
-        for value in values:
-            grid = np.full(cells[0] * cells[1], np.nan)
-            for number, part in zip(numbers, np.split(value[order], first[1:])):
-                if part.size >= CELL_MATCHES:
-                    grid[number] = np.median(part)
-            maps.append(grid.reshape(cells))
-        return maps[0], maps[1]
+        edges = [np.arange(-(-size // CELL_PX) + 1) * CELL_PX for size in self.shape]
+        if not self.parts:
+            error, y_parallax = np.full((2, *(of.size - 1 for of in edges)), np.nan)
+            return error, y_parallax
+        x, y, *values = np.hstack(self.parts)
+        few = np.histogram2d(y, x, edges)[0] < CELL_MATCHES
+        error, y_parallax = binned_statistic_2d(y, x, values, "median", edges).statistic
+        return np.where(few, np.nan, error), np.where(few, np.nan, y_parallax)
 
 
 def _draw_sift(
@@ -309,23 +320,15 @@ def _draw_warping(path: Path, city: str, tiles: Path, rows: Sequence[Mapping[str
         difference = tile.left - warped
         spread = float(np.nanpercentile(np.abs(difference), 95))
         gray = {"cmap": "gray", "vmin": limits[0], "vmax": limits[1]}
-        for axis, image, title, style in (
-            (line[0], tile.left, f"{tile.name} ({row['class']}): left", gray),
-            (line[1], scaled, "right", gray),
-            (line[2], tile.disparity, "disparity (px)", {"cmap": pictures.DISPARITIES}),
-            (
-                line[3],
-                tile.sums.match(tile.warped),
-                f"warped right, r = {tile.correlation:.3f}",
-                gray,
-            ),
-            (
-                line[4],
-                difference,
-                "left − warped right",
-                {"cmap": pictures.DIFFERENCES, "vmin": -spread, "vmax": spread},
-            ),
-        ):
+        coloured = {"cmap": pictures.DIFFERENCES, "vmin": -spread, "vmax": spread}
+        panels = (
+            (tile.left, f"{tile.name} ({row['class']}): left", gray),
+            (scaled, "right", gray),
+            (tile.disparity, "disparity (px)", {"cmap": pictures.DISPARITIES}),
+            (warped, f"warped right, r = {tile.correlation:.3f}", gray),
+            (difference, "left − warped right", coloured),
+        )
+        for axis, (image, title, style) in zip(line, panels):
             axis.set_facecolor("black" if style is gray else np.array(pictures.NO_VALUE) / 255)
             axis.set(xticks=[], yticks=[])
             shown = axis.imshow(image[::step, ::step], interpolation="nearest", **style)

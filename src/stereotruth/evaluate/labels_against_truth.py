@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -24,8 +24,8 @@ from ..core.numerics.statistics import LIMITS, Calibration, ErrorSum
 from ..core.products.files import write_json, write_table
 from ..core.products.grids import blocks, open_grid
 from ..core.products.rasters import read_tile
-from ..core.status import carries_label
-from ..tiles.manifest import Tile, labelled_tiles, tile_flags
+from ..core.status import Status
+from ..tiles.manifest import Tile, labelled_tiles
 
 log = logging.getLogger("stereotruth")
 Bools = NDArray[np.bool_]
@@ -113,8 +113,7 @@ class Truth:
         return dict(zip(GROUPS, masks))
 
 
-@dataclass(frozen=True, eq=False)
-class Labels:
+class Labels(NamedTuple):
     """Labels in a window; arrays [h, w].
 
     ``disparity`` and its standard ``uncertainty`` float64 px, NaN where there is none; ``status``
@@ -129,60 +128,38 @@ class Labels:
     def read(cls, store: xr.Dataset, rows: slice, cols: slice) -> Labels:
         """The labels of a disparity store in a window [rows, cols]."""
         window = store.isel(y=rows, x=cols)
-        return cls(
-            window["disparity"].values.astype(np.float64),
-            window["status"].values,
-            window["uncertainty"].values.astype(np.float64),
-        )
-
-
-def status_names(store: xr.Dataset) -> tuple[str, ...]:
-    """Names of the status values of a disparity store and its tiles, by value."""
-    attrs = store["status"].attrs
-    names = tile_flags(dict(zip(attrs["flag_values"], attrs["flag_meanings"].split())))
-    return tuple(names.get(value, f"status_{value}") for value in range(max(names) + 1))
+        disparity, status, uncertainty = (window[name].values for name in cls._fields)
+        return cls(disparity.astype(np.float64), status, uncertainty.astype(np.float64))
 
 
 @dataclass
 class Comparison:
     """Figures of labels against the truth; see ``MEANING``.
 
-    ``statuses``: names by value, "labelled" among them; ``counts`` int64[groups, statuses].
+    ``counts``: pixels by group and status.
     """
 
-    statuses: tuple[str, ...]
     labels: int = 0
     errors: ErrorSum = field(default_factory=ErrorSum)
     calibration: Calibration = field(default_factory=Calibration)
     parallax: ErrorSum = field(default_factory=ErrorSum)
-    counts: NDArray[np.int64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.counts = np.zeros((len(GROUPS), len(self.statuses)), np.int64)
+    counts: NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros((len(GROUPS), len(Status)), np.int64)
+    )
 
     def merge(self, other: Comparison) -> None:
-        """Add the figures of other pixels. Raises ValueError if their statuses are others.
-
-        Where one has masks and the other none, one may have more statuses.
-        """
-        names, more = sorted((self.statuses, other.statuses), key=len)
-        if names != more[: len(names)]:
-            raise ValueError(f"statuses {self.statuses} and {other.statuses}")
-        self.statuses = more
-        self.counts, counts = (
-            np.pad(c, ((0, 0), (0, len(more) - c.shape[1]))) for c in (self.counts, other.counts)
-        )
+        """Add the figures of other pixels."""
         self.labels += other.labels
         self.errors.merge(other.errors)
         self.calibration.merge(other.calibration)
         self.parallax.merge(other.parallax)
-        self.counts += counts
+        self.counts += other.counts
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready; px and shares 0 … 1 (null where there are no such pixels)."""
         pixels = dict(zip(GROUPS, self.counts.sum(axis=1).tolist()))
-        labels = [k for k, name in enumerate(self.statuses) if carries_label(name)]
-        labelled = dict(zip(GROUPS, self.counts[:, labels].sum(axis=1).tolist()))
+        has_label = [status for status in Status if status.carries_label]
+        labelled = dict(zip(GROUPS, self.counts[:, has_label].sum(axis=1).tolist()))
         return {
             "labels": self.labels,
             "errors": self.errors.figures(),
@@ -195,7 +172,7 @@ class Comparison:
                 for share, group in zip(SHARES, GROUPS)
             },
             "status": {
-                group: {name: n for name, n in zip(self.statuses, row) if n}
+                group: {status.label: n for status, n in zip(Status, row) if n}
                 for group, row in zip(GROUPS, self.counts.tolist())
             },
         }
@@ -210,13 +187,12 @@ class ByClass:
     def merge(self, other: ByClass) -> None:
         """Add the figures of other pixels."""
         for name, part in other.parts.items():
-            self.parts.setdefault(name, Comparison(part.statuses)).merge(part)
+            self.parts.setdefault(name, Comparison()).merge(part)
 
     @property
     def total(self) -> Comparison:
         """All classes but water."""
-        statuses = next(iter(self.parts.values())).statuses if self.parts else ("labelled",)
-        result = Comparison(statuses)
+        result = Comparison()
         for name in self.classes:
             if name != "water":
                 result.merge(self.parts[name])
@@ -278,12 +254,12 @@ def open_truth(path: str | Path, epipolar: Mapping[str, Any] | None = None) -> x
     return group
 
 
-def compare(labels: Labels, truth: Truth, statuses: tuple[str, ...]) -> ByClass:
-    """Labels against the truth of the same window; ``statuses``: names by value."""
+def compare(labels: Labels, truth: Truth) -> ByClass:
+    """Labels against the truth of the same window."""
     labelled = np.isfinite(labels.disparity)
     groups = truth.groups()
     seen = groups["visible"]
-    size = len(statuses)
+    size = len(Status)
     index = truth.kind.astype(np.intp) * size + labels.status
     counts = np.stack(
         [np.bincount(index[group], minlength=size * len(CLASSES)) for group in groups.values()]
@@ -294,7 +270,7 @@ def compare(labels: Labels, truth: Truth, statuses: tuple[str, ...]) -> ByClass:
     result = ByClass()
     for kind in np.unique(truth.kind):
         here = truth.kind == kind
-        part = result.parts[CLASSES[kind]] = Comparison(statuses)
+        part = result.parts[CLASSES[kind]] = Comparison()
         part.labels = int((here & labelled).sum())
         part.errors.add(errors[good & here])
         part.calibration.add(errors[stated & here], labels.uncertainty[stated & here])
@@ -336,10 +312,9 @@ def compare_scene(
     """
     store = open_grid(disparity)
     true = open_truth(truth, store.attrs["epipolar"])
-    statuses = status_names(store)
 
     def block(window: tuple[slice, slice]) -> ByClass:
-        return compare(Labels.read(store, *window), Truth.read(true, *window), statuses)
+        return compare(Labels.read(store, *window), Truth.read(true, *window))
 
     result = SceneComparison(scene)
     windows = blocks(store["disparity"].shape, BLOCK)
@@ -350,7 +325,7 @@ def compare_scene(
 
         def of_tile(tile: Tile) -> ByClass:
             here = Truth.read(true, *tile.window)
-            return compare(read_tile_labels(folder, tile, store), here, statuses)
+            return compare(read_tile_labels(folder, tile, store), here)
 
         found = labelled_tiles(folder, scene)
         done = _mapped(of_tile, found, workers, f"{scene}: tiles compared")
@@ -360,25 +335,8 @@ def compare_scene(
     return result
 
 
-TABLE = (
-    "scope",
-    "labels",
-    "mean_absolute_px",
-    "median_px",
-    "rms_px",
-    "nmad_px",
-    *(f"share_over_{limit:g}_px" for limit in LIMITS),
-    *SHARES,
-    "y_parallax_rms_px",
-    "y_parallax_mean_px",
-    "y_parallax_max_px",
-    "share_below_1_uncertainty",
-    "share_below_2_uncertainties",
-)
-
-
 def table_row(scope: str, comparison: Comparison) -> dict[str, Any]:
-    """One line of the table: columns of ``TABLE``."""
+    """One line of the table."""
     figures = comparison.figures()
     errors, parallax = figures["errors"], figures["y_parallax"]
     return {
@@ -439,23 +397,22 @@ def evaluate_truth(
                 scene.disparity, scene.truth, scene.tiles, scene=scene.name, workers=workers
             )
         )
-    write_table(csv_file, table(result), TABLE)
+    write_table(csv_file, table(result), list(table_row("", Comparison())))
     write_json(json_file, result.figures() | {"provenance": dict(provenance or {})})
     shown = result.all_tiles if result.tiles else result.whole
     row = table_row("", shown.total)
+    factors = {
+        "mean_absolute_px": 1,
+        "share_over_1_px": 100,
+        "y_parallax_rms_px": 1,
+        "share_of_visible_labelled": 100,
+        "share_of_hidden_labelled": 100,
+    }
+    values = [np.nan if row[key] is None else row[key] * k for key, k in factors.items()]
     log.info(
         "%s: mean absolute error %.3f px, %.3f %% over 1 px; y-parallax %.3f px rms; %.1f %% of "
         "the visible and %.1f %% of the hidden pixels labelled",
         "tiles" if result.tiles else "scene",
-        *(
-            np.nan if value is None else value * factor
-            for value, factor in (
-                (row["mean_absolute_px"], 1),
-                (row["share_over_1_px"], 100),
-                (row["y_parallax_rms_px"], 1),
-                (row["share_of_visible_labelled"], 100),
-                (row["share_of_hidden_labelled"], 100),
-            )
-        ),
+        *values,
     )
     return result

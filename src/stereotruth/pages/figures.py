@@ -135,7 +135,15 @@ class Plot:
             if HREF in element.attrib:
                 element.set("href", element.attrib.pop(HREF))
         svg = ElementTree.tostring(root, "unicode")
-        return Chart(self.title, self.caption, svg, as_csv(values))
+        if not values:
+            return Chart(self.title, self.caption, svg)
+        stream = io.StringIO()
+        writer = csv.DictWriter(stream, list(values[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(values)
+        data = base64.b64encode(stream.getvalue().encode("utf-8")).decode("ascii")
+        uri = f"data:text/csv;charset=utf-8;base64,{data}"
+        return Chart(self.title, self.caption, svg, uri)
 
 
 def _say(group: ElementTree.Element, texts: Sequence[str], links: Sequence[str]) -> None:
@@ -182,15 +190,3 @@ def log_axis(axis: Axis) -> None:
     axis.set_major_locator(LogLocator(10, (1, 2, 5)))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_locator(NullLocator())
-
-
-def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows as a data URI of a CSV file; "" of none."""
-    if not rows:
-        return ""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    data = base64.b64encode(stream.getvalue().encode("utf-8")).decode("ascii")
-    return f"data:text/csv;charset=utf-8;base64,{data}"

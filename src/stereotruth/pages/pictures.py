@@ -29,9 +29,7 @@ Picture = NDArray[np.uint8]
 
 DISPARITIES, DIFFERENCES, ERRORS = "viridis", "RdBu", "inferno"
 NO_VALUE = (226, 229, 233)
-SUN = (
-    np.array([-1.0, -1.0, math.sqrt(2.0)]) / 2.0
-)  # of a hillshade: from the top left, 45 degrees high
+SUN = np.array([-1.0, -1.0, 2.0**0.5]) / 2.0  # of a hillshade: the top left, 45 degrees high
 # Of methods, kinds and the like: apart for all eyes, with a contrast of 3:1 on white as on black
 SERIES = ("#4693fa", "#c68505", "#653bfd", "#59a090", "#8b5a2e", "#226c95")
 
@@ -103,6 +101,7 @@ def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
         figure.savefig(scratch, dpi=dpi, metadata={"Software": None}, bbox_inches=bounds)
 
 
+STOPS = 13  # of the colours of a scale in CSS
 QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the picture shrinks
 
 
@@ -137,12 +136,6 @@ def encode_file(path: Path, limit: int, side: int) -> str:
     return encode(shrink(cv2.imread(str(path))[..., ::-1], side), limit)
 
 
-def gradient(cmap: str, stops: int = 13) -> str:
-    """The colours of a matplotlib map as a CSS gradient, left to right."""
-    rgb = (colormaps[cmap](np.linspace(0, 1, stops))[:, :3] * 255 + 0.5).astype(int)
-    return f"linear-gradient(90deg,{','.join(f'rgb({r},{g},{b})' for r, g, b in rgb)})"
-
-
 @dataclass(frozen=True)
 class Scale:
     """A scale of colours: what stands at its ends, and the colours as a CSS gradient."""
@@ -154,7 +147,9 @@ class Scale:
     @classmethod
     def of(cls, cmap: str, low: str, high: str) -> Scale:
         """Of a matplotlib map."""
-        return cls(low, high, gradient(cmap))
+        rgb = (colormaps[cmap](np.linspace(0, 1, STOPS))[:, :3] * 255 + 0.5).astype(int)
+        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in rgb)
+        return cls(low, high, f"linear-gradient(90deg,{stops})")
 
 
 @dataclass(frozen=True)

@@ -160,9 +160,9 @@ def table(
     if not rows:
         return None
     names = list(rows[0]) if columns is None else [c for c in columns if c in rows[0]]
-    of = [(links or {}).get(name, {}) for name in names]
+    ways = [(links or {}).get(name, {}) for name in names]
     lines = tuple(
-        tuple(replace(c, href=to.get(c.text, "")) for c, to in zip(cells_of(names, row), of))
+        tuple(replace(c, href=to.get(c.text, "")) for c, to in zip(cells_of(names, row), ways))
         for row in rows
     )
     return Table(columns_of(names, rows), (("", lines),))

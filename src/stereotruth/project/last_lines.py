@@ -10,7 +10,7 @@ from typing import Any
 
 from stereobench.scores.score_method import describe
 
-from ..evaluate.surface_models.page import describe as describe_surface_model
+from ..evaluate.surface_models.score import describe as describe_surface_model
 
 
 def last_lines(products: Iterable[str]) -> list[str]:

@@ -9,9 +9,8 @@ from typing import Any
 from ..core.errors import InputError
 from ..core.sheets import lidar_files, store_names
 from ..core.tables import epoch_year
-from ..evaluate.surface_models.page import describe, write_verdict
 from ..evaluate.surface_models.reference import LidarReference, RasterReference
-from ..evaluate.surface_models.score import score_surface_model
+from ..evaluate.surface_models.score import describe, score_surface_model, write_verdict
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, Epochs
 from ..lidar.ingest import ingest
 

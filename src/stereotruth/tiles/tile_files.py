@@ -17,6 +17,7 @@ from ..core.numerics.geometry import turn
 from ..core.products.files import link
 from ..core.products.provenance import digest, file_sha256
 from ..core.products.rasters import write_tiff
+from ..core.products.resumable_grids import Ledger
 from ..epipolar.intersection import intersect
 from ..epipolar.warping import agreement, warp_rows
 from .label_surfaces import Buildings, heights_above_ground, label_surfaces

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,8 @@ from stereocities.camera import locate, project, rays
 from stereocities.render import prepare
 from stereocities.surfaces import terrain_heights
 from stereocities.truth import open_truth, simulate_truth, truth_at
-from stereotruth.core.errors import InputError
 from stereotruth.epipolar.model import EpipolarModel, ImageModel
-from stereotruth.evaluate.epipolar_truth import height_edges, truth_window, write_grid_truth
+from stereotruth.evaluate.epipolar_truth import truth_window, write_grid_truth
 from stereotruth.sensor.rpc import SensorModel
 
 from ...synthetic.small_cities import ONE_BOX, TOWN
@@ -161,23 +159,3 @@ def test_pixel_centres_that_are_raw_centres_hold_the_raw_truth(tmp_path: Path) -
     far = np.min([np.hypot(*(xyz[:, :2] - b[:2]).T) - np.hypot(*b[4:6]) for b in boxes], axis=0)
     assert (far < 6).all()  # beside or below a box that the LiDAR alone has
     assert not ((upright("changed_right") > 0) & (changed > 0)).any()
-
-
-def test_edges_are_between_neighbours() -> None:
-    disparity = np.zeros((7, 9))
-    disparity[:, 5:] = 1.5
-    disparity[0, 0] = np.nan
-    built = np.zeros(disparity.shape, bool)
-    built[4:, 5:] = True
-    edge = height_edges(disparity, built)
-    assert (edge[:3, 4:6] == 2).all() and (edge[4:, 4:6] == 1).all()
-    assert edge[3].tolist() == [0, 0, 0, 0, 1, 2, 0, 0, 0]  # a built pixel beside the left one only
-    assert not edge[:, :4].any() and not edge[:, 6:].any()
-
-
-def test_models_of_other_images_are_refused(tmp_path: Path) -> None:
-    model = replace(turned(TOWN, (0.0, 0.0)), left_size=(600, 640))
-    model.save(tmp_path / "epipolar.json")
-    with pytest.raises(InputError, match="600 x 640"):
-        write_grid_truth(TOWN, TOWN.scenes[0], tmp_path / "epipolar.json", tmp_path / "t.zarr")
-    assert not (tmp_path / "t.zarr").exists()

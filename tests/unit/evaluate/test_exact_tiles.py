@@ -13,6 +13,7 @@ from stereotruth.tiles.stereo_dataset import StereoDataset, match_inside
 SIZE = 192
 
 
+@pytest.mark.slow
 def test_labels_of_a_training_city_bring_the_right_image_to_the_left(tmp_path):
     make_city(5, tmp_path / "5", size=SIZE, seed=3)
     gather([tmp_path / "5"], [tmp_path / "5"], tmp_path / "three", 3)

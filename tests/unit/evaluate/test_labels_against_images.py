@@ -1,74 +1,54 @@
-"""Tiles of a city held against their images: tables and figures."""
+"""The right image warped by the labels of a scene."""
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
-
 import numpy as np
-import pytest
+from figures import draw_panels
 
-from stereotruth.evaluate import labels_against_images
+from stereotruth.core.products import grids
+from stereotruth.epipolar import warping
+from stereotruth.evaluate.labels_against_images import warp_scene
+from stereotruth.tiles import tile_checks
 
-from ...synthetic.pictures import colours_in, read_picture
-from ...synthetic.tiled_scene import make_scene, rough, rows_of, run
+from ...synthetic.truth_scene import write_disparity
 
-
-@pytest.mark.slow
-def test_evaluation_of_a_city(tmp_path: Path) -> None:
-    scene = make_scene(tmp_path / "s1", bare_from=240, texture=rough)
-    out, matches = tmp_path / "Town", tmp_path / "matches.csv"
-    run([scene], out, size=96, matches=matches)
-    files = {name: tmp_path / f"{name}.csv" for name in ("table4", "sift", "warping")}
-    files |= {f"{name}_figure": tmp_path / f"{name}.png" for name in ("sift", "warping")}
-    stores = {"s1": (scene.left, scene.right, scene.disparity)}
-    table = labels_against_images.evaluate_city("Town", out, matches, stores, **files)
-
-    def read(name: str) -> list[dict[str, str]]:
-        with files[name].open(newline="") as stream:
-            return list(csv.DictReader(stream))
-
-    assert [row["city"] for row in read("table4")] == [row["city"] for row in table]
-    tiles = [row for row in rows_of(out) if row["complete"] == "yes"]
-    assert sum(row["pair_number"] for row in table) == len(tiles)
-    found = sum(int(tile["sift_matches"]) for tile in tiles)
-    assert sum(row["matches_number"] for row in table) == found
-    for row in table:
-        kind = row["city"].removeprefix("Town (").rstrip(")")
-        mine = [float(t["sift_mean_absolute_error_px"]) for t in tiles if t["class"] == kind]
-        mean = row["mean_of_mean_absolute_disparity_errors_px"]
-        assert mean == pytest.approx(np.mean(mine), abs=2e-4)
-    by_scope = {(row["scope"], row["name"]): row for row in read("sift")}
-    assert by_scope["city", "Town"]["matches"] == by_scope["scene", "s1"]["matches"]
-    for tile in tiles:
-        row = by_scope["tile", tile["tile"]]
-        assert row["matches"] == tile["sift_matches"]
-        mean = float(tile["sift_mean_error_px"])
-        assert float(row["mean_error_px"]) == pytest.approx(mean, abs=2e-4)
-    warped = {(row["scope"], row["name"]): row for row in read("warping")}
-    assert float(warped["city", "Town"]["correlation"]) > 0.999
-    assert warped["scene", "s1"]["pixels"] == warped["city", "Town"]["pixels"]
-    assert 0.3 < float(warped["scene", "s1"]["labelled_share"]) < 0.8
-    sift = read_picture(files["sift_figure"])
-    red, _, blue = np.moveaxis(sift[: sift.shape[0] // 2].astype(int), 2, 0)
-    kinds = {tile["class"] for tile in tiles}
-    curves = {"building": blue - red > 40, "vegetation": red - blue > 40}
-    for kind, curve in curves.items():
-        assert (curve.mean() > 1e-3) == (kind in kinds)
-    warping = read_picture(files["warping_figure"])
-    middle = warping[len(warping) // 2 - 90 : len(warping) // 2 + 90]
-    for part in np.split(middle[:, : warping.shape[1] // 5 * 5], 5, axis=1):
-        assert part.std() > 30
-    assert colours_in(warping[:, :150]) == 0 and colours_in(warping) > 0.05  # grey at the left
+# ------------------------------------------------------------------------------------ warping
 
 
-def test_a_line_of_table_4_by_hand():
-    tiles = [np.array([0.1, -0.3, 0.2, 8.2]), np.array([-1.0]), np.array([])]
-    row = labels_against_images.table4_row("Town (building)", tiles)
-    assert (row["pair_number"], row["matches_number"]) == (2, 5)
-    assert row["mean_of_mean_disparity_errors_px"] == pytest.approx((2.05 - 1.0) / 2)
-    assert row["mean_of_mean_absolute_disparity_errors_px"] == pytest.approx((2.2 + 1.0) / 2)
-    assert row["gross_mismatches_share"] == pytest.approx(0.2)
-    assert row["without_gross_mean_of_mean_absolute_disparity_errors_px"] == pytest.approx(0.6)
-    empty = labels_against_images.table4_row("Town (vegetation)", [np.array([])])
-    assert (empty["pair_number"], empty["mean_of_mean_disparity_errors_px"]) == (0, "")
+def texture(x, y):
+    return 1000 + 200 * np.sin(x / 5.0 + 0.02 * y) + 150 * np.cos(y / 7.0 - x / 11.0)
+
+
+def test_warping_finds_the_left_image_again(scene, tmp_path):
+    shape = scene.model.shape
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
+    disparity = 3.3 + 0.02 * x
+    disparity[:, 50:60] = np.nan
+    right_x = x  # right(x_r) = texture at the left position x with x − d(x) = x_r
+    right = texture((right_x + 3.3) / 0.98, y)
+    layer = grids.Layer("uint16", 0, {"units": "DN", "long_name": "image"})
+    stores = []
+    for name, image in (("left", texture(x, y)), ("right", right)):
+        with grids.atomic_store(tmp_path / f"{name}.zarr") as scratch:
+            arrays = grids.create_grid(
+                scratch, shape, {"image": layer}, chunk=128, shard=256, attrs={}
+            )
+            arrays["image"][:] = np.rint(image).astype("uint16")
+        stores.append(tmp_path / f"{name}.zarr")
+    right_way = write_disparity(scene, tmp_path / "d.zarr", disparity)
+    sums = warp_scene(*stores, right_way).sums
+    assert sums.coefficient > 0.9999
+    assert sums.count > 0.9 * disparity.size * (shape[1] - 20) / shape[1]
+    wrong_way = write_disparity(scene, tmp_path / "e.zarr", -disparity)
+    assert warp_scene(*stores, wrong_way).sums.coefficient < 0.9
+
+    values = np.rint(texture(x, y))[:64, :64]
+    tile = tile_checks.WarpedTile(
+        "T_1",
+        values,
+        warping.warp_rows(np.rint(right)[:64], (x - disparity)[:64, :64]),
+        disparity[:64, :64],
+    )
+    assert tile.correlation > 0.9999
+    draw_panels(tile, tmp_path / "panels" / "T_1.png")
+    assert [p.name for p in (tmp_path / "panels").iterdir()] == ["T_1.png"]

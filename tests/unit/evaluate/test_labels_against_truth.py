@@ -17,7 +17,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from stereotruth.core.errors import InputError
 from stereotruth.evaluate import labels_against_truth
 
-from ...synthetic.truth_scene import WATER, Scene, perfect_labels, sensor, write_disparity
+from ...synthetic.truth_scene import WATER, Scene, perfect_labels, write_disparity
 
 # -------------------------------------------------------------------------------------- truth
 
@@ -26,29 +26,6 @@ def compared(scene: Scene, store: Path, workers: int = 2) -> labels_against_trut
     return labels_against_truth.compare_scene(
         store, scene.truth, None, scene="S-1", workers=workers
     )
-
-
-def test_perfect_labels_have_no_error(scene, tmp_path):
-    store = write_disparity(scene, tmp_path / "d.zarr", perfect_labels(scene))
-    figures = compared(scene, store).whole.figures()
-    assert figures["errors"]["count"] > 60_000
-    assert figures["errors"]["max"] < 1e-4
-    assert figures["y_parallax"]["max"] < 1e-3
-    assert figures["calibration"]["share_below_1"] == 1.0
-    assert figures["share_of_visible_labelled"] == 1.0
-    assert figures["share_of_hidden_labelled"] == 1.0
-
-
-def test_errors_are_those_of_the_alignment(scene, tmp_path):
-    """Labels by a right sensor that is off by (0.3, -0.4) px: parallax runs along raw rows."""
-    off = sensor("right", (0.3, -0.4))
-    wrong = replace(scene.model, right=off)
-    store = write_disparity(scene, tmp_path / "d.zarr", perfect_labels(scene, wrong))
-    at = np.array([189.0, 209.0])
-    before = np.array(scene.model.right_to_epipolar(*at))
-    moved = np.array(scene.model.right_to_epipolar(*(at + np.array([0.3, -0.4])))) - before
-    errors = compared(scene, store).whole.figures()["errors"]
-    assert errors["bias"] == pytest.approx(-moved[0], abs=0.003)
 
 
 def test_counts_are_those_of_a_plain_loop(scene, tmp_path, monkeypatch):
@@ -194,19 +171,3 @@ def test_missing_and_unlike_stores_are_refused(scene, tmp_path):
     store = write_disparity(other, tmp_path / "moved.zarr", perfect_labels(scene))
     with pytest.raises(InputError, match="another epipolar model"):
         labels_against_truth.compare_scene(store, scene.truth, None, scene="S-1")
-
-
-def test_scenes_with_and_without_masks_are_added_up() -> None:
-    """Those with masks have one status more; other names are other figures."""
-    Comparison = labels_against_truth.Comparison
-    names = "no_points", "labelled"
-    few, more = Comparison(names), Comparison((*names, "masked"))
-    few.counts[:], more.counts[:] = 1, 10
-    for a, b in ((few, more), (more, few)):
-        total = Comparison(a.statuses)
-        total.merge(a)
-        total.merge(b)
-        assert total.statuses == more.statuses
-        assert (total.counts == [11, 11, 10]).all()
-    with pytest.raises(ValueError, match="statuses"):
-        few.merge(Comparison(("labelled", "no_points")))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereotruth.pages.figures import AXES, DASHES, MARKERS, Plot, as_csv, look, styled
+from stereotruth.pages.figures import AXES, DASHES, MARKERS, Plot, look, styled
 from stereotruth.pages.pictures import SERIES
 
 from ...browser import needs_chromium, screenshot
@@ -50,11 +50,6 @@ def test_texts_are_no_formulas_and_equal_input_gives_equal_bytes():
     assert "http" not in chart.svg  # asks for nothing
 
 
-def test_a_text_too_few_is_told():
-    with pytest.raises(ValueError, match="shorter"):
-        scattered(["A", "B"])
-
-
 @pytest.mark.parametrize("back", [WHITE, DARK])
 def test_colours_have_a_contrast_of_3_to_light_and_dark_pages(back):
     for colour in (*SERIES, AXES):
@@ -72,10 +67,6 @@ def test_series_differ_in_more_than_colour():
     looks = [look(k) for k in range(len(SERIES))]
     for key in ("color", "marker", "linestyle"):
         assert len({str(of[key]) for of in looks}) == len(SERIES) == len(DASHES) == len(MARKERS)
-
-
-def test_no_rows_are_no_csv():
-    assert as_csv([]) == ""
 
 
 @needs_chromium

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stereotruth.pages.page import PAPER, way, write_page
+from stereotruth.pages.page import PAPER, write_page
 
 TEMPLATE = """{% extends "base.html.jinja" %}
 {% from "parts.html.jinja" import cards with context %}
@@ -33,9 +33,3 @@ def test_six_cards_are_shown_and_the_rest_is_folded(tmp_path):
         assert first.count("<dt>") == 6
         assert rest.count("<dt>") == count - 6
         assert folded in text
-
-
-def test_the_way_is_relative_to_the_page():
-    assert way("results/report/A/index.html", "results/report/index.html") == "../index.html"
-    assert way("audit/own/index.html", "tiles/A") == "../../tiles/A"
-    assert way("page.html", None) is None

@@ -22,7 +22,7 @@ SCORES = {
 def truth(errors: list[float]) -> dict:
     """What ``truth.json`` holds of tiles with these errors."""
     result = SceneComparison("A")
-    result.all_tiles.parts["ground"] = part = Comparison(("no_points", "labelled"))
+    result.all_tiles.parts["ground"] = part = Comparison()
     part.errors.add(np.array(errors))
     return result.figures()
 

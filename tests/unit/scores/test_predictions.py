@@ -1,10 +1,10 @@
-"""A method over a dataset: what is kept, what is made again, and what is refused."""
+"""A method over a dataset: what is kept, made again and refused, and what is told of the method."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-import subprocess
-import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stereobench.scores.prediction_files import read_prediction, read_record, read_uncertainty
-from stereobench.scores.predictions import predict
+from stereobench.scores.predictions import identity, predict
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import write_table
 from stereotruth.core.products.rasters import read_disparity
@@ -147,33 +147,6 @@ def test_what_a_folder_lacks_is_told(dataset):
         run(dataset, settings | {"polarity": "positive"})
 
 
-def test_images_that_do_not_fit_each_other_are_refused(dataset):
-    write(Path("data/test/right/KM_right_2.tiff"), np.zeros((8, 13), np.uint16))
-    with pytest.raises(InputError, match=r"left image is \(8, 12\) uint16, right one \(8, 13\)"):
-        run(dataset)
-
-
-def test_no_record_is_told(tmp_path):
-    with pytest.raises(InputError, match="no predictions"):
-        read_record(tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the system counts as it does")
-def test_peak_memory_is_that_of_the_process_alone():
-    """Not that of the process which started it, as Linux's ru_maxrss would have it."""
-    ballast = np.ones(80 << 20)  # 640 MB
-    code = (
-        "from stereobench.scores.predictions import peak_memory_mb as peak;"
-        "import numpy as np;"
-        "before = peak(); held = np.ones(25 << 20); print(before, peak())"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    before, after = map(float, run.stdout.split())
-    assert ballast.nbytes / 2**20 > before > 10
-    assert after - before == pytest.approx(200, abs=30)
-
-
 UNCERTAIN = """
 import numpy as np
 
@@ -209,22 +182,6 @@ def test_uncertainties_are_kept_beside_the_disparities(dataset):
         run(dataset, {"kind": "function", "function": "mine.py:negative"})
 
 
-def test_a_folder_may_have_uncertainties(dataset):
-    for n in (1, 2, 3):
-        write(Path(f"theirs/KM_{n}.tif"), np.zeros(SHAPE, np.float32))
-    np.save("theirs/KM_2_uncertainty.npy", np.full(SHAPE, 0.5))
-    run(dataset, {"kind": "folder", "folder": "theirs"})
-    first, second, _ = dataset.pairs()
-    assert read_uncertainty("out", first) is None
-    assert np.all(read_uncertainty("out", second) == 0.5)
-    np.save("theirs/KM_2_uncertainty.npy", np.full(SHAPE, 0.25))
-    run(dataset, {"kind": "folder", "folder": "theirs"})
-    assert np.all(read_uncertainty("out", second) == 0.25)
-    np.save("theirs/KM_2_uncertainty.npy", np.full((2, 2), 0.25))
-    with pytest.raises(InputError, match=r"uncertainty of pair KM_2 is \(2, 2\)"):
-        run(dataset, {"kind": "folder", "folder": "theirs"})
-
-
 def test_a_dataset_of_somebody_else_overwrites_nothing(dataset):
     """Its manifest names a pair by a path to a file of the user."""
     mine = Path("mine.tiff")
@@ -247,3 +204,30 @@ def test_a_folder_of_predictions_of_somebody_else_names_no_other_place(tmp_path,
     (tmp_path / "predictions.json").write_text(text)
     with pytest.raises(InputError, match=r"predictions\.json: (the name of a pair|no record)"):
         read_record(tmp_path)
+
+
+def test_sgm_is_that_of_opencv():
+    found = identity({"kind": "sgm"}, code="abc")
+    assert found["version"].startswith("opencv-python") and found["licence"].startswith("Apache")
+    assert found["code"] == "abc" and found["files"] == {}
+
+
+def test_a_function_is_of_its_distribution(tmp_path):
+    found = identity({"kind": "function", "function": "scipy.ndimage:shift"})
+    assert found["version"] == f"scipy {version('scipy')}" and "BSD" in found["licence"]
+    of_a_file = identity({"kind": "function", "function": "mine.py:f"})
+    assert of_a_file["version"] is of_a_file["licence"] is of_a_file["code"] is None
+
+
+def test_what_the_entry_says_counts_and_files_have_checksums(tmp_path):
+    for name in ("weights.pt", "code/infer.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    files = [tmp_path / "weights.pt", tmp_path / "code/infer.py"]
+    found = identity({"kind": "command", "licence": "MIT", "version": "2.1"}, files)
+    assert (found["licence"], found["version"]) == ("MIT", "2.1")
+    assert found["files"] == {
+        name: hashlib.sha256(name.encode()).hexdigest() for name in ("weights.pt", "code/infer.py")
+    }
+    other = identity({"kind": "command"})
+    assert other["licence"] is other["version"] is None

@@ -10,7 +10,7 @@ import pytest
 
 from stereobench.scores.compare_methods import compare
 from stereobench.scores.protocols import PROTOCOLS, Protocol, one_id, pair_sha256, protocol_of
-from stereobench.scores.published_rows import PUBLISHED, beside_published
+from stereobench.scores.published import PUBLISHED
 from stereobench.scores.score_method import score
 from stereotruth.core.config.methods import StereoDatasetEntry
 from stereotruth.core.errors import InputError
@@ -39,25 +39,14 @@ def test_the_frozen_ones_keep_their_ids():
     "change",
     [
         {"disparity_range": (-128, 65)},
-        {"split": None},
-        {"thresholds_px": (3.0, 1.0)},
         {"truth": "exact"},
         {"grows_with_height": False},
-        {"mask": "all"},
-        {"holes": "left out"},
         {"pooling": "mean of pairs"},
     ],
     ids=lambda change: next(iter(change)),
 )
 def test_whatever_changes_has_another_id(change):
     assert replace(WHU, **change).identified(PAIRS)["id"] != WHU.identified(PAIRS)["id"]
-
-
-def test_pairs_are_of_the_id_and_their_order_is_not():
-    of = WHU.identified(PAIRS)
-    assert WHU.identified(PAIRS[::-1]) == of
-    for others in (PAIRS[:1], [PAIRS[0], ("b", "3" * 64)], [PAIRS[0], ("c", PAIRS[1][1])]):
-        assert WHU.identified(others)["id"] != of["id"]
 
 
 def test_a_pair_is_its_pixels(compared):
@@ -102,34 +91,3 @@ def test_tables_show_one_id_and_refuse_two(compared, tmp_path):
     with pytest.raises(InputError, match=rf"several protocols .*Two: {protocol}; Half: own-"):
         compare(dataset, "test", folders, predictions, tmp_path / "out", seed=1)
     assert one_id([]) == ""
-
-
-def test_the_exact_truth_is_asked_for(compared, tmp_path):
-    dataset = StereoDataset("toy", compared / "data", "whu", (-64, 128))
-    with pytest.raises(InputError, match=r"KM_1 has no exact truth"):
-        score(
-            dataset,
-            "test",
-            "Two",
-            compared / "match/two",
-            tmp_path / "out",
-            replace(PLAN, protocol="exact-2026"),
-        )
-
-
-def test_published_rows_say_where_they_stand_and_what_is_not_known():
-    own = {
-        "label": "Mine",
-        "tiles": 4,
-        "protocol": {"name": "whu-2023", "id": "whu-2023-12345678"},
-        "all": {"filled_epe_px": 1.5, "filled_d1_3_px_share": 0.125, "labelled": 9},
-    }
-    table = beside_published([own])
-    assert table.rows[0]["d1_percent"] == 12.5 and table.rows[0]["source"] == "here, 4 pairs"
-    by_name = {row["method"]: row for row in table.rows}
-    assert by_name["HMSM-Net"]["epe_px"] == 1.672 and by_name["SGM"]["d1_percent"] == 50.79
-    assert by_name["TGRNet"]["epe_px"] == 1.586
-    assert all(row["source"] and row["not_known"] for row in table.rows[1:])
-    assert "whu-2023-12345678" in table.shown[0][0]
-    nothing = beside_published([own | {"protocol": {"name": "own", "id": "own-1"}}])
-    assert nothing.rows == [] and "Nothing is published" in nothing.shown[0][0]

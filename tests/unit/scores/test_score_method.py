@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stereobench.scores.predictions import predict
-from stereobench.scores.score_method import choose, describe, score
-from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
+from stereobench.scores.score_method import describe, score
+from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from ...synthetic.images import write
 from ...synthetic.toy_benchmark import CITIES, PLAN, SHAPE, rows
@@ -76,20 +75,6 @@ def test_stated_uncertainties_are_held_against_the_errors(compared, tmp_path):
     none = json.loads((compared / "benchmark/half/scores.json").read_text())
     assert none["confidence"] == []
     assert not (compared / "benchmark/half/sparsification.csv").exists()
-
-
-def test_pictures_are_chosen_of_all_cities():
-    def pairs(**counts):
-        return [
-            Pair(f"{city}_{n}", city, "test", Path(), Path(), None)
-            for city, count in counts.items()
-            for n in range(count)
-        ]
-
-    names = [pair.name for pair in choose(pairs(A=9, B=1, C=4), 5)]
-    assert names == ["A_3", "A_5", "B_0", "C_1", "C_2"]
-    assert len(choose(pairs(A=2, B=3), 9)) == 5
-    assert choose(pairs(A=2), 0) == []
 
 
 def test_layers_of_the_tiles_are_strata_of_the_scores(compared, tmp_path):

@@ -14,7 +14,6 @@ from stereobench.scores.strata import (
     exact_truth,
     height_m_per_px,
     label_strata,
-    match_in_tile,
     near_step,
 )
 from stereotruth.core.products.grids import seal
@@ -77,16 +76,6 @@ def own(tmp_path):
             stores[name] = group.create_array(name, data=np.zeros((60, 70), dtype))
         seal(tmp_path / kind / "Town/T-1.zarr")
     return pair, Products(*(tmp_path / name for name in ("tiles", "project", "truth"))), stores
-
-
-def test_labels_know_whether_the_right_tile_holds_their_match():
-    labels = np.full((3, 8), np.nan, np.float32)
-    labels[0], labels[1] = 2.5, -2.0
-    found = match_in_tile(labels)
-    assert found["match_inside"][0].tolist() == [False] * 3 + [True] * 5
-    assert found["match_inside"][1].tolist() == [True] * 6 + [False] * 2
-    assert (found["match_outside"][:2] == ~found["match_inside"][:2]).all()
-    assert not (found["match_inside"] | found["match_outside"])[2].any()
 
 
 def test_status_and_classes_are_those_of_the_window(own):

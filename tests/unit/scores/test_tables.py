@@ -1,12 +1,15 @@
-"""Tables in the form of the paper."""
+"""Tables in the form of the paper, and of methods on the same tiles."""
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from stereobench.scores import published_scores
-from stereobench.scores.tables import make_tables, read_scores, write_tables
-from stereotruth.core.errors import InputError
+from stereobench.scores.published import TABLE7, training_data
+from stereobench.scores.tables import by_city, difference, differences, of_fine_tuned, of_methods
 
 from ...synthetic.toy_benchmark import rows, texts, titles
 
@@ -58,11 +61,16 @@ def summary(method, kind, cities, fine_tuned_of=None):
     }  # fmt: skip
 
 
+def tables_of(methods, trained, *, beside_paper):
+    of_cities = (of(methods, trained, beside_paper=beside_paper) for of in (by_city, of_fine_tuned))
+    return of_methods(methods, beside_paper=beside_paper), *of_cities
+
+
 def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels(tmp_path):
     cities = {"Kunming": (100, 1.0, 0.1), "Qichun": (300, 3.0, 0.5), "Wuhan": (50, 4.0, 0.25)}
     methods = [summary("sgm", "sgm", cities), summary("net", "stereonet", cities)]
     methods.append(summary("tuned", "stereonet", cities, fine_tuned_of="net"))
-    five, six, seven, _ = make_tables(methods, ["Kunming", "Qichun"], beside_paper=True)
+    five, six, seven = tables_of(methods, ["Kunming", "Qichun"], beside_paper=True)
     caption, shown = five.shown[1]
     assert caption == "The paper's, on the real WHU-Stereo."
     assert texts(shown) == [
@@ -91,24 +99,81 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels(tmp_pat
     pooled = next(row for row in six.rows if row["city"] == "all of group")
     assert pooled["filled_epe_px"] == 2.5 and pooled["labelled"] == 400
     assert titles(seven.shown[0][1])[1::2] == ["Net: EPE, px", "Tuned: EPE, px"]
-    assert seven.rows[1]["paper_epe_px"] == published_scores.TABLE7["Kunming"]["stereonet"][0]
+    assert seven.rows[1]["paper_epe_px"] == TABLE7["Kunming"]["stereonet"][0]
     methods.append(summary("again", "stereonet", cities, fine_tuned_of="net"))
-    _, _, both, _ = make_tables(methods, [], beside_paper=False)
+    both = of_fine_tuned(methods, [], beside_paper=False)
     names = [name.partition(":")[0] for name in titles(both.shown[0][1])[1::2]]
     assert names == ["Net", "Tuned", "Again"]
-    five, six, seven, _ = make_tables(methods[:2], [], beside_paper=False)
+    five, six, seven = tables_of(methods[:2], [], beside_paper=False)
     assert len(five.shown) == len(six.shown) == 1
-    write_tables([seven], tmp_path)
+    seven.write(tmp_path)
     assert "fine_tuned_of" in (tmp_path / "fine_tuned.md").read_text()
     assert (tmp_path / "fine_tuned.csv").read_text() == "method\n"
 
 
-def test_a_city_that_the_paper_lacks_has_no_line_among_its_figures():
-    methods = [summary("sgm", "sgm", {"Utopia": (1, 1.0, 0.1), "Yingde": (1, 1.0, 0.1)})]
-    _, six, *_ = make_tables(methods, [], beside_paper=True)
-    assert [line[0] for line in texts(six.shown[1][1])] == ["Yingde"]
+FIELDS = ["tile", "labelled", "filled_epe_px", "filled_d1_3_px_share"]
 
 
-def test_missing_scores_are_told(tmp_path):
-    with pytest.raises(InputError, match="no scores"):
-        read_scores([tmp_path])
+def folder(path: Path, rows: list[tuple]) -> Path:
+    path.mkdir()
+    with (path / "scores.csv").open("w", newline="") as stream:
+        csv.writer(stream).writerows([FIELDS, *rows])
+    return path
+
+
+def of(name: str) -> dict:
+    return {"label": name, "thresholds_px": [3.0], "bootstrap": 500}
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> list[Path]:
+    """Tiles from 1 to 8 px hard; the second method is 0.1 to 0.3 px better on all but one."""
+    rng = np.random.default_rng(3)
+    hard = np.linspace(1, 8, 12)
+    gain = rng.uniform(0.1, 0.3, 12)
+    gain[4] = -0.1
+    first = [(f"T_{n}", 1000, e, e / 10) for n, e in enumerate(hard)]
+    second = [(f"T_{n}", 1000, e - g, e / 10) for n, (e, g) in enumerate(zip(hard, gain))]
+    empty = ("T_empty", 0, "", "")
+    return [folder(tmp_path / "a", [*first, empty]), folder(tmp_path / "b", [*second, empty])]
+
+
+def test_a_small_gain_on_hard_and_easy_tiles_is_told(folders: list[Path]) -> None:
+    table = differences([of("A"), of("B")], folders, seed=1)
+    (row,) = table.rows
+    assert (row["method"], row["less"], row["tiles"]) == ("B", "A", 12)
+    assert -0.3 < row["epe_px_low"] < row["epe_px"] < row["epe_px_high"] < 0
+    assert row["epe_px_better_share"] == pytest.approx(11 / 12, abs=1e-6)
+    assert row["d1_share"] == row["d1_share_low"] == row["d1_share_high"] == 0
+    assert row["d1_share_better_share"] == 0
+    assert "| B minus A | −0.1" in table.markdown() and "| 92 | +0.00 [" in table.markdown()
+    assert differences([of("A"), of("B")], folders, seed=1) == table
+
+
+def test_tiles_count_by_their_pixels() -> None:
+    first = {"a": np.array([10.0, 10]), "b": np.array([90.0, 90])}
+    second = {"b": np.array([90.0, 180]), "a": np.array([10.0, 0]), "c": np.array([5.0, 5])}
+    found = difference(first, second, 100, 1)
+    assert found["tiles"] == 2 and found["better_share"] == 0.5
+    assert found["value"] == pytest.approx((180 - 100) / 100)
+    assert found["low"] is None  # two tiles are too few
+    assert difference(first, {}, 100, 1)["value"] is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "trained_on", "seen"),
+    [
+        ({"kind": "sgm"}, "nothing", "no"),
+        ({"kind": "pandora", "pipeline": "mccnn"}, "US3D", "yes"),
+        ({"kind": "function", "function": "a:b"}, "not stated", "not stated"),
+        ({"kind": "folder", "trained_on": ["us3d", "whu"]}, "us3d; whu", "yes"),
+        (
+            {"kind": "stereonet", "weights": "results/train/us3d/stereonet/best.pt"},
+            "us3d, training pairs",
+            "training pairs only",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_known_or_stated_of_a_method(settings, trained_on, seen):
+    found = training_data({"dataset": "us3d", "settings": settings})
+    assert found == {"trained_on": trained_on, "licence": "not stated", "seen_in_training": seen}

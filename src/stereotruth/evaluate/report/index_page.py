@@ -210,7 +210,9 @@ def _benchmarks(root: Path, out: Path) -> Table | None:
     groups = []
     for folder in sorted(root.glob("benchmark/*/")):
         page = folder / "index.html"
-        scored = [(file, _read(file)) for file in folder.glob("*/scores.json")]
+        scored = [(file, _read(file)) for file in sorted(folder.glob("*/scores.json"))]
+        epe = [of["all"]["filled_epe_px"] for _, of in scored]
+        scored = [scored[k] for k in np.argsort(np.array(epe, float), kind="stable")]  # None last
         lines = tuple(
             (
                 link_cell(folder.name, way(out, page) if page.is_file() else None),
@@ -223,18 +225,13 @@ def _benchmarks(root: Path, out: Path) -> Table | None:
                 value_cell(of["all"]["valid_share"], ".1f", 100, " %"),
                 value_cell(of["tiles"], "d"),
             )
-            for file, of in sorted(scored, key=lambda s: (_epe(s[1]), s[0]))
+            for file, of in scored
         )  # fmt: skip
         if lines:
             groups.append(("", lines))
     titles = ("dataset", "method", "EPE", "wrong", "valid", "pairs")
     columns = tuple(Column(title, k > 1) for k, title in enumerate(titles))
     return Table(columns, tuple(groups)) if groups else None
-
-
-def _epe(scores: Mapping[str, Any]) -> float:
-    value = scores["all"]["filled_epe_px"]
-    return float("inf") if value is None else value
 
 
 def _audits(root: Path, out: Path) -> Table | None:

@@ -22,13 +22,27 @@ from ...core.job import progress
 from ...core.products.files import read_table
 from ...pages.page import way, write_page
 from ...pages.pictures import DISPARITIES, Scale, encode_file
-from ...pages.tables import Table, cells_of, columns_of, limit, minus, missed, table, texts, words
+from ...pages.tables import minus, missed, table
 from ...tiles.manifest import NONE, SPLITS, read_manifest
 from ...tiles.orientation import PixelSize
 from ...tiles.quick_looks import SPLIT_COLOURS, status_colours
-from . import tile_pictures
-from .headlines import headlines
-from .maps import calibration, histograms, tile_map
+from .city_pictures import (
+    LARGE,
+    NO_MATCH,
+    TilePictures,
+    disparity_counts,
+    disparity_limits,
+    histograms,
+    tile_map,
+    tile_pictures,
+)
+from .sections import (
+    exact_truth,
+    headlines,
+    quality_gates,
+    residuals,
+    table4_beside_the_paper,
+)
 
 Place = str | Path
 Row = Mapping[str, str]
@@ -43,21 +57,6 @@ KINDS = ("left", "right", "disparity", "status")
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
 FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest
 FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and these come first
-
-# Table 4 of the paper: (city, class), pairs, matches, mean of mean errors and of mean absolute
-# errors in px.
-PUBLISHED = (
-    ("Kunming", "building", 36, 3576, -0.69, 0.48),
-    ("Kunming", "vegetation", 216, 54838, -0.869, 0.66),
-    ("Qichun", "building", 128, 16643, -0.11, 0.51),
-    ("Qichun", "vegetation", 736, 99457, -0.5, 0.79),
-    ("Yingde", "building", 90, 13969, 0.09, 0.58),
-    ("Yingde", "vegetation", 438, 63226, 0.11, 0.73),
-    ("Shaoguan", "building", 77, 6744, -0.24, 0.42),
-    ("Wuhan", "building", 20, 1776, -0.37, 0.49),
-    ("Hengyang", "building", 22, 1139, -0.03, 0.32),
-    ("US3D", "building", 49, 3750, -0.20, 0.89),
-)
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,10 @@ def write_report(
     rows = read_manifest(folder)
     labelled = [row for row in rows if row["complete"] == "yes"]
     export, truth = _record(folder / "export.json"), _record(files.truth)
-    alignments, refined = _records(files.alignments), _records(files.refinements)
+    alignments, refined = (
+        {scene: record for scene, file in of.items() if (record := _record(file))}
+        for of in (files.alignments, files.refinements)
+    )
     sizes = _pixel_sizes(folder, labelled)
     height = max((size.height_m for size in sizes.values()), default=None)
     truth_rows = _rows(files.truth_table)
@@ -156,7 +158,7 @@ def write_report(
         "residuals": [
             {
                 "scene": scene,
-                **_residuals(record, refined.get(scene, {})),
+                **residuals(record, refined.get(scene, {})),
                 "figures": [
                     (title, uri)
                     for title, of in (
@@ -171,8 +173,8 @@ def write_report(
         "table4": table4_beside_the_paper(_rows(files.table4)),
         "sift": table(_rows(files.sift)),
         "sift_figure": embedded(files.sift_figure),
-        "truth": _exact_truth(truth_rows, truth),
-        "quality": _quality_gates(export.get("quality", {})),
+        "truth": exact_truth(truth_rows, truth),
+        "quality": quality_gates(export.get("quality", {})),
         **_of_tiles(city, folder, rows, sizes, sliders, workers),
     }
     write_page(out, TEMPLATE, values)
@@ -188,17 +190,19 @@ def _of_tiles(
 ) -> dict[str, Any]:
     """The page's values about the tiles, with their pictures; large ones of ``sliders`` tiles."""
     labelled = [row["tile"] for row in rows if row["complete"] == "yes"]
-    large = _chosen(labelled, sliders)
+    # evenly chosen, the first and the last included
+    picked = np.linspace(0, len(labelled) - 1, min(sliders, len(labelled))).round().astype(int)
+    large = {labelled[k] for k in picked}
     small = len(KINDS) * len(labelled) + 2 * (len(rows) - len(labelled))
     thumbnail = THUMBNAIL_PX, _allowance("thumbnails", small)
-    big = SLIDER_PX, _allowance("sliders", len(tile_pictures.LARGE) * len(large))
+    big = SLIDER_PX, _allowance("sliders", len(LARGE) * len(large))
     with ThreadPoolExecutor(workers) as pool:
-        counted = list(pool.map(lambda row: tile_pictures.disparity_counts(folder, row), rows))
-        limits = tile_pictures.disparity_limits(counted)
+        counted = list(pool.map(lambda row: disparity_counts(folder, row), rows))
+        limits = disparity_limits(counted)
 
-        def draw(row: Row) -> tile_pictures.TilePictures:
+        def draw(row: Row) -> TilePictures:
             size = sizes.get(row["scene"])
-            return tile_pictures.tile_pictures(
+            return tile_pictures(
                 folder,
                 row,
                 thumbnail=thumbnail,
@@ -210,11 +214,8 @@ def _of_tiles(
         drawn = list(progress(pool.map(draw, rows), len(rows), f"{city}: tiles drawn"))
     made = {row["tile"]: of for row, of in zip(rows, drawn)}
     spans = {name: np.ptp(of.disparity_px) for name, of in made.items() if of.layers}
-    statuses: Counter[str] = Counter()
-    for row in rows:
-        if row["complete"] == "yes":
-            statuses.update(status_counts(row))
-    total = max(statuses.total(), 1)
+    statuses = {row["tile"]: status_counts(row) for row in rows}
+    every = sum((statuses[tile] for tile in labelled), Counter())
 
     def by(column: str, values: Iterable[str]) -> dict[str, Counter[int]]:
         return {
@@ -230,11 +231,11 @@ def _of_tiles(
         "first": max(spans, key=spans.__getitem__, default=None),
         "disparities": limits and Scale.of(DISPARITIES, *(minus(f"{v:.0f} px") for v in limits)),
         "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
-        "statuses": {name: count / total for name, count in statuses.items() if count},
-        "status_colours": status_colours(list(statuses)),
-        "shares": {row["tile"]: _shares(status_counts(row)) for row in rows},
+        "statuses": _shares(every),
+        "status_colours": status_colours(list(every)),
+        "shares": {tile: _shares(counts) for tile, counts in statuses.items()},
         "split_colours": SPLIT_COLOURS,
-        "no_match": f"rgb{tile_pictures.NO_MATCH}",
+        "no_match": f"rgb{NO_MATCH}",
         "histograms": [
             chart
             for chart in (
@@ -253,14 +254,6 @@ def _of_tiles(
     }
 
 
-def _chosen(names: Sequence[str], most: int) -> set[str]:
-    """At most so many of the names, evenly chosen, the first and the last included."""
-    if len(names) <= most:
-        return set(names)
-    picked = np.linspace(0, len(names) - 1, most).round().astype(int) if most else []
-    return {names[k] for k in picked}
-
-
 def _allowance(share: str, count: int) -> int:
     """Bytes of each of ``count`` pictures of a kind."""
     return min(MOST_BYTES[share], int(PICTURE_BYTES * BASE64 * SHARES[share] / max(count, 1)))
@@ -269,12 +262,6 @@ def _allowance(share: str, count: int) -> int:
 def _rows(path: Place | None) -> list[dict[str, str]]:
     """Rows of a CSV file; none if there is no such file."""
     return list(read_table(path)) if path is not None and Path(path).is_file() else []
-
-
-def _records(files: Mapping[str, Place]) -> dict[str, dict[str, Any]]:
-    """Records by scene, those that are there."""
-    found = {scene: _record(file) for scene, file in files.items()}
-    return {scene: record for scene, record in found.items() if record}
 
 
 def _record(path: Place | None) -> dict[str, Any]:
@@ -299,131 +286,19 @@ def _pixel_sizes(folder: Path, labelled: Sequence[Row]) -> dict[str, PixelSize]:
     return found
 
 
-def status_counts(row: Row) -> dict[str, int]:
+def status_counts(row: Row) -> Counter[str]:
     """Pixels of a tile by status."""
-    return {
-        name.removeprefix("count_"): int(value)
-        for name, value in row.items()
-        if name.startswith("count_") and value
-    }
-
-
-def _shares(counts: Mapping[str, int]) -> dict[str, float]:
-    total = max(sum(counts.values()), 1)
-    return {name: count / total for name, count in counts.items() if count}
-
-
-def _residuals(record: Record, later: Record) -> dict[str, Any]:
-    """Of a scene: model, warnings, a table of the points, and what a refinement did."""
-    points = []
-    for view in ("left", "right"):
-        for point in record.get(view, {}).get("gcps", []):
-            row = {"image": view, "GCP": point["id"]}
-            for which in ("before", "after", "leave_one_out"):
-                pair = point.get(which, [None])
-                row[f"{which}_px"] = "" if None in pair else f"{np.hypot(*pair):.3f}"
-            used = "yes" if point.get("used", True) else "no"
-            points.append(row | {"used": used, "reason": point.get("reason", "")})
-    found = later.get("refinement", {})
-    ties = [
+    return Counter(
         {
-            "tie points": f"{words(name)} {when}",
-            **{f"{k}_px": f"{v:.4f}" for k, v in values.items() if isinstance(v, int | float)},
+            name.removeprefix("count_"): int(value)
+            for name, value in row.items()
+            if name.startswith("count_") and value
         }
-        for name in ("disparity", "y_parallax")
-        for when in ("before", "after")
-        if (values := found.get(when, {}).get(name))
-    ]
-    return {
-        "model": record.get("model", ""),
-        "warnings": list(dict.fromkeys([*record.get("warnings", []), *later.get("warnings", [])])),
-        "points": table(points),
-        "refinement": found,
-        "ties": table(ties),
-    }
-
-
-def table4_beside_the_paper(rows: Sequence[Row]) -> Table | None:
-    """This run's rows of the paper's Table 4 above the published ones, in its columns first."""
-    if not rows:
-        return None
-    names = list(rows[0])
-    ours = tuple(cells_of(names, row) for row in rows)
-    published = tuple(
-        cells_of(names, dict(zip(names, [f"{name} ({kind})", *map(str, numbers)])))
-        for name, kind, *numbers in PUBLISHED
     )
-    groups = (("this run", ours), ("published: Li et al. 2023, table 4", published))
-    return Table(columns_of(names, rows), groups)
 
 
-def _exact_truth(rows: Sequence[Row], record: Record) -> dict[str, Any] | None:
-    """Figures of scenes and surfaces, of each tile, by status, and of the uncertainty."""
-    if not rows:
-        return None
-    of_tiles = record.get("exported_tiles", {})
-    groups = of_tiles.get("status", {})
-    names = list(dict.fromkeys(name for counts in groups.values() for name in counts))
-    by_status = [
-        {"pixels that are": words(group), "count": str(total)}
-        | {f"share_{name}": f"{counts.get(name, 0) / total:.6f}" for name in names}
-        for group, counts in groups.items()
-        if (total := sum(counts.values()))
-    ]
-    stated = of_tiles.get("calibration", {})
-    caption = "Errors below once and twice their uncertainty; dashed: where it is right."
-    if stated.get("share_below_1") is not None:
-        caption += (
-            f" {100 * stated['share_below_1']:.1f} % of all are below their uncertainty (68.3 % is "
-            f"right), {100 * stated['share_below_2']:.1f} % below twice theirs (95.4 %)."
-        )
-    meaning = record.get("meaning", {})
-    return {
-        "whole": table([r for r in rows if not r["scope"].startswith("tile ")]),
-        "tiles": table([r for r in rows if r["scope"].startswith("tile ")]),
-        "status": table(by_status),
-        "calibration": calibration(stated.get("deciles", []), caption),
-        "meaning": {words(k): v for k, v in meaning.items() if isinstance(v, str)},
-    }
-
-
-def _quality_gates(record: Record) -> dict[str, Any] | None:
-    """The limits of the gates, the figures of each scene with the gates that it misses, doubts.
-
-    And what the images say of the labels of each scene, by surface.
-    """
-    scenes = record.get("scenes", {})
-    if not scenes:
-        return None
-    rows = [{"scene": scene, **texts(figures)} for scene, figures in scenes.items()]
-    shown = [
-        name
-        for name in dict.fromkeys(["scene", "quality", *rows[0]])
-        if name != "lidar" and any(row.get(name) for row in rows)  # what was read has its own card
-    ]
-    return {
-        "table": table(rows, shown),
-        "limits": [limit(name, v) for name, v in record.get("limits", {}).items() if v is not None],
-        "doubts": [
-            f"{scene}: {doubt['text']}"
-            for scene, found in record.get("doubts", {}).items()
-            for doubt in found
-        ],
-        "strips": table(
-            [
-                {"scene": scene, **texts(row)}
-                for scene, figures in scenes.items()
-                for row in ((figures.get("lidar") or {}).get("strips") or {}).get("strips", ())
-            ]
-        ),
-        "surfaces": table(
-            [
-                {"scene": scene, "of": words(of), **texts(figures)}
-                for scene, by in record.get("surfaces", {}).items()
-                for of, figures in by.items()
-            ]
-        ),
-    }
+def _shares(counts: Counter[str]) -> dict[str, float]:
+    return {name: count / counts.total() for name, count in counts.items() if count}
 
 
 def provenance(records: Mapping[str, Record]) -> list[dict[str, Any]]:

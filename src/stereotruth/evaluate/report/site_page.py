@@ -42,6 +42,7 @@ def write_site_page(
     names = {frozenset(pair): scene for scene, pair in scenes.items()}
     rows = _pair_rows(pairs, names)
     made = [pair.names for pair in pairs if frozenset(pair.names) in names]
+    links = {scene: f"{way(out, page)}#scene-{scene}" for scene in scenes}
     values = {
         "city": city,
         "index": way(out, index),
@@ -49,7 +50,7 @@ def write_site_page(
         "map": _map(images),
         "chart_of_pairs": _chart(rows, way(out, page)),
         "images": _images_table(images),
-        "pairs": _pairs_table(rows, way(out, page)),
+        "pairs": table(rows, links={"scene": links if page else {}}),
         "counts": (len(images), len(pairs), len(made)),
         "residuals": _residuals(adjusted),
         "remarks": _remarks(adjusted),
@@ -184,12 +185,6 @@ def _images_table(images: Sequence[SiteImage]) -> Table | None:
             }
         )
     return table(rows)
-
-
-def _pairs_table(rows: Sequence[Mapping[str, str]], page: str | None) -> Table | None:
-    """All pairs; those that are scenes lead to their part of the page."""
-    scenes = [row["scene"] for row in rows if row["scene"]] if page else []
-    return table(rows, links={"scene": {scene: f"{page}#scene-{scene}" for scene in scenes}})
 
 
 def _number(value: Any, form: str = ".3f") -> str:

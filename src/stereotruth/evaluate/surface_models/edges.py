@@ -17,16 +17,21 @@ deviation of 1 m has 0.56 and 0. Vertical noise below a tenth of the step has no
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from ...core.numerics.statistics import quantile_bin
+from ...core.numerics.statistics import ErrorSum, Scale
 from ...lidar.height_raster import Floats
 from .reference import BUILDING, NONE, OTHER, TREE, WATER, Lattice
+
+# All-NaN rows are edges that are dropped: NumPy need not warn of them.
+_quiet = partial(warnings.catch_warnings, action="ignore", category=RuntimeWarning)
 
 LEAST_STEP_M = 3.0  # of a roof's edge over the ground beside it
 REACH_M = 4.0  # of profiles to each side, and of the points that tell the line
@@ -44,7 +49,7 @@ KNOWN = 0.8  # share of a profile that has heights at least
 TOGETHER = 2000  # edges
 S = np.arange(-REACH_M + STEP_M / 2, REACH_M, STEP_M)  # m
 SHARP = (S < 0).astype(np.float64)
-BINS = 400  # of position errors, to REACH_M
+POSITIONS = Scale((1.0,), 0.01, 801)  # m, to ±4
 
 
 @dataclass(frozen=True)
@@ -154,13 +159,6 @@ def _lines(lattice: Lattice, i: NDArray, j: NDArray, classified: bool) -> Edges:
     return Edges(*(v[good] for v in (x, y, nx, ny, top, foot)))
 
 
-def _quiet():
-    """All-NaN rows are edges that are dropped: numpy need not warn of them."""
-    import warnings
-
-    return warnings.catch_warnings(action="ignore", category=RuntimeWarning)
-
-
 @dataclass(frozen=True)
 class Profiles:
     """What a model has at edges [n]: position error and its outward part (m, NaN if unknown).
@@ -227,10 +225,8 @@ class EdgeErrors:
 
     edges: int = 0
     measured: int = 0  # with heights around
-    found: int = 0  # of them, with a step in the model
-    error: float = 0.0
+    errors: ErrorSum = field(default_factory=lambda: ErrorSum(POSITIONS))  # where a step is found
     outward: float = 0.0
-    histogram: NDArray[np.int64] = field(default_factory=lambda: np.zeros(BINS, np.int64))
     profile: Floats = field(default_factory=lambda: np.zeros(S.size))
     profiles: NDArray[np.int64] = field(default_factory=lambda: np.zeros(S.size, np.int64))
 
@@ -238,12 +234,8 @@ class EdgeErrors:
         """Add edges as they were measured."""
         self.edges += seen.found.size
         self.measured += int(seen.measured.sum())
-        self.found += int(seen.found.sum())
-        error = seen.error[seen.found]
-        self.error += float(error.sum())
+        self.errors.add(seen.error[seen.found])
         self.outward += float(seen.outward[seen.found].sum())
-        index = np.minimum((error / REACH_M * BINS).astype(np.int64), BINS - 1)
-        self.histogram += np.bincount(index, minlength=BINS)
         share = seen.share[seen.found]
         self.profile += np.nansum(share, axis=(0, 1))
         self.profiles += np.isfinite(share).sum(axis=(0, 1))
@@ -252,7 +244,7 @@ class EdgeErrors:
         """JSON-ready; m. ``measured_share``: of the reference's edges, those with heights around;
         ``missing_share``: of these, those where the model has no step. All else is of the rest.
         """
-        n = self.found
+        n = self.errors.count
         shares = {
             "measured_share": self.measured / self.edges if self.edges else None,
             "missing_share": 1 - n / self.measured if self.measured else None,
@@ -260,14 +252,11 @@ class EdgeErrors:
         lacking = dict.fromkeys(("position_error_m", "median_m", "p90_m", "outward_m"))
         if not n:
             return {"edges": self.edges, **shares, **lacking}
-        median, p90 = (
-            (quantile_bin(self.histogram, share) + 0.5) * REACH_M / BINS for share in (0.5, 0.9)
-        )
         values = {
             **shares,
-            "position_error_m": self.error / n,
-            "median_m": median,
-            "p90_m": p90,
+            "position_error_m": self.errors.mean_absolute,
+            "median_m": self.errors.quantile_of_size(0.5),
+            "p90_m": self.errors.quantile_of_size(0.9),
             "outward_m": self.outward / n,
         }
         return {"edges": self.edges} | {name: round(v, 4) for name, v in values.items()}

@@ -11,7 +11,6 @@ Statistics 17, 521–526) over parts of the scene, which knows of errors that ar
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -19,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from ...core.kernels import kernel
 from ...core.numerics.statistics import huber_weights, median_and_nmad, reweighted_fit
 from ...lidar.height_raster import Floats, Window
 from .edges import Edges, measure
@@ -80,34 +78,17 @@ class Part:
         return self.window.at(self.x + east, self.y + north) - self.z
 
 
-@kernel
-def _cost(
-    heights: NDArray[np.float32],
-    col: Floats,
-    row: Floats,
-    z: Floats,
-    scale: float,
-    farthest: float,
-) -> tuple[float, int]:
-    """Sum over places of a function that is quadratic near 0, then linear, and level at last.
+def _cost(differences: Floats, scale: float, *, holes_cost: bool = False) -> float:
+    """Mean over places of a function that is quadratic near 0, then linear, and level at last.
 
-    ``col``, ``row``: in the window's cells. Also the number of places that have a height.
+    ``holes_cost``: places without a height count as far off, so that a search gains nothing by
+    leaving the model; else they do not count.
     """
-    total, known = 0.0, 0
-    h, w = heights.shape
-    for k in range(z.size):
-        j, i = math.floor(col[k]), math.floor(row[k])
-        d = np.nan
-        if i >= 0 and j >= 0 and i < h - 1 and j < w - 1:
-            u, v = col[k] - j, row[k] - i
-            d = (1 - v) * ((1 - u) * heights[i, j] + u * heights[i, j + 1])
-            d += v * ((1 - u) * heights[i + 1, j] + u * heights[i + 1, j + 1])
-            d -= z[k]
-        if math.isfinite(d):
-            size = math.sqrt(d * d + scale * scale) - scale
-            total += size if size < farthest else farthest
-            known += 1
-    return total, known
+    size = np.minimum(np.hypot(differences, scale) - scale, FARTHEST_M)
+    known = size[np.isfinite(size)]
+    if holes_cost:
+        return float(known.sum() + (size.size - known.size) * FARTHEST_M) / max(size.size, 1)
+    return float(known.mean()) if known.size else FARTHEST_M
 
 
 def _thinned(parts: Sequence[Part], most: int, seed: int) -> list[Part]:
@@ -122,23 +103,6 @@ def _differences(parts: Sequence[Part], east: float, north: float) -> Floats:
     return np.concatenate([part.difference(east, north) for part in parts])
 
 
-def _mean_cost(
-    parts: Sequence[Part], shift: Floats, scale: float, *, holes_cost: bool = False
-) -> float:
-    """Mean over all places that have a height.
-
-    ``holes_cost``: the others count as far off, so that a search gains nothing by leaving it.
-    """
-    total, known, places = 0.0, 0, 0
-    for part in parts:
-        cells = part.window.cells(part.x + shift[0], part.y + shift[1])
-        cost, n = _cost(part.window.heights, *cells, part.z + shift[2], scale, FARTHEST_M)
-        total, known, places = total + cost, known + n, places + part.z.size
-    if holes_cost:
-        return (total + (places - known) * FARTHEST_M) / max(places, 1)
-    return total / known if known else FARTHEST_M
-
-
 def _search(parts: Sequence[Part]) -> tuple[float, float, float]:
     """The shift to half a metre, from coarse steps to fine."""
     best = (np.inf, 0.0, 0.0, 0.0)
@@ -151,9 +115,7 @@ def _search(parts: Sequence[Part]) -> tuple[float, float, float]:
                 if not np.isfinite(d).any():
                     continue
                 up = float(np.nanmedian(d))
-                cost = _mean_cost(
-                    parts, np.array([east, north, up]), LEAST_SCALE_M, holes_cost=True
-                )
+                cost = _cost(d - up, LEAST_SCALE_M, holes_cost=True)
                 best = min(best, (cost, float(east), float(north), up))
         centre, reach = best[1:3], step
     return best[1:]
@@ -163,7 +125,7 @@ def _fit(parts: Sequence[Part], start: Sequence[float], scale: float, size: floa
     """The shift (east, north, up) of least cost, from nearby."""
     start = np.asarray(start, dtype=np.float64)
     found = minimize(
-        lambda shift: _mean_cost(parts, shift, scale),
+        lambda shift: _cost(_differences(parts, *shift[:2]) - shift[2], scale),
         start,
         method="Nelder-Mead",
         options={

@@ -7,28 +7,141 @@
     verdict.figures()["edges"]["position_error_m"]
 
 The model is registered first (:mod:`.registration`); all else is said of it where it then lies.
+:func:`write_verdict` leaves ``scores.json``, ``errors.csv`` and ``index.html`` in a folder.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, maximum_filter
 
 from ...core.errors import InputError
 from ...core.job import progress
+from ...core.numerics import statistics
+from ...core.numerics.statistics import ErrorSum
+from ...core.products.files import atomic_folder, write_json, write_table
+from ...core.products.grids import blocks
 from ...lidar.frames import DEFAULT_EPOCHS, Epochs
 from ...lidar.height_raster import Floats, HeightRaster, Window
-from .edges import REACH_M, EdgeErrors, find_edges, measure
-from .height_errors import SOLID, HeightErrors, strata
-from .reference import TREE, WATER, Reference, lattice_of, lattice_step
+from ...pages.figures import AXES, Chart, Plot, styled
+from ...pages.page import way, write_page
+from ...pages.pictures import (
+    DIFFERENCES,
+    SERIES,
+    Picture,
+    Scale,
+    colours,
+    encode,
+    hillshade,
+    shrink,
+)
+from ...pages.tables import Headline, minus, table, texts
+from .edges import HIGH, LOW, REACH_M, SHARP, EdgeErrors, S, find_edges, measure, near_steps
+from .reference import (
+    BUILDING,
+    GROUND,
+    OTHER,
+    TREE,
+    WATER,
+    Lattice,
+    Reference,
+    lattice_of,
+    lattice_step,
+)
 from .registration import GROUPS, SEARCH_M, Part, Registration, register
 
 log = logging.getLogger("stereotruth")
+
+# ------------------------------------------------------ vertical errors by what the reference shows
+
+METRES = statistics.Scale((1.0, 3.0), 0.005, 40_001)  # to ±100 m
+STEP_REACH_M = 3.0  # around a step, or the shadow of one: heights there say where the edge is
+CROWN_REACH_M = 1.5  # around a crown, below which slanting pulses reach the ground
+SLOPES_DEG = (0.0, 5.0, 15.0, 30.0, 90.0)
+SMOOTH_M = 2.0  # over which slopes are taken
+SOLID = "all but trees and water"
+OPEN = "off steps"  # and off crowns: the vertical error proper
+STEPS = "beside steps and trees"
+
+
+@dataclass
+class HeightErrors:
+    """Errors in m of a stratum: model less reference."""
+
+    points: int = 0  # of the reference; the errors are those where the model has a height
+    errors: ErrorSum = field(default_factory=lambda: ErrorSum(METRES))
+
+    def add(self, errors: Floats) -> None:
+        """Add errors [n], NaN where the model has no height."""
+        self.points += errors.size
+        self.errors.add(errors[np.isfinite(errors)])
+
+    def figures(self) -> dict[str, float | int | None]:
+        """JSON-ready; ``known_share``: completeness, of the reference's points."""
+        e = self.errors
+        shares = e.shares_beyond("m")
+        if not e.count:
+            lacking = ("mean_m", "mean_absolute_m", "rms_m", "median_m", "nmad_m", "le90_m")
+            known = 0.0 if self.points else None
+            return {"points": self.points, "known_share": known, **dict.fromkeys(lacking), **shares}
+        values = {
+            "known_share": e.count / self.points,
+            "mean_m": e.bias,
+            "mean_absolute_m": e.mean_absolute,
+            "rms_m": e.rms,
+            "median_m": e.median,
+            "nmad_m": e.nmad,
+            "le90_m": e.quantile_of_size(0.9),
+            **shares,
+        }
+        return {"points": self.points} | {k: round(float(v), 4) for k, v in values.items()}
+
+
+def slopes(lattice: Lattice) -> Floats:
+    """Slope in degrees of the ground around each square, NaN where there is none."""
+    ground = (lattice.kind == GROUND) | (lattice.kind == OTHER)
+    sigma = SMOOTH_M / lattice.step_m
+    weight = gaussian_filter(ground.astype(np.float64), sigma)
+    middle = np.nanmean(lattice.z[ground]) if ground.any() else 0.0
+    z = gaussian_filter(np.where(ground, lattice.z - middle, 0.0), sigma)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        south, east = np.gradient(z / weight, lattice.step_m)
+        found = np.degrees(np.arctan(np.hypot(south, east)))
+    return np.where(weight > 0.3, found, np.nan)
+
+
+def strata(lattice: Lattice, classified: bool) -> dict[str, NDArray[np.bool_]]:
+    """The squares of each stratum, by its name; only of the lattice's own window."""
+    kind, own = lattice.kind, lattice.own & np.isfinite(lattice.z)
+    solid = own & (kind != TREE) & (kind != WATER)
+    reach = 2 * int(np.ceil(CROWN_REACH_M / lattice.step_m)) + 1
+    crown = maximum_filter(kind == TREE, reach, mode="nearest")
+    open_places = solid & ~near_steps(lattice, STEP_REACH_M) & ~crown & lattice.even
+    found = {OPEN: open_places, STEPS: solid & ~open_places, SOLID: solid}
+    if classified:
+        found["ground, off steps"] = open_places & (kind == GROUND)
+        found["buildings, off steps"] = open_places & (kind == BUILDING)
+        found["other, off steps"] = open_places & (kind == OTHER)
+        found["trees"] = own & (kind == TREE)
+        found["water"] = own & (kind == WATER)
+    slope = slopes(lattice)
+    ground = open_places & (kind != BUILDING)
+    for low, high in pairwise(SLOPES_DEG):
+        with np.errstate(invalid="ignore"):
+            chosen = ground & (slope >= low) & (slope < high)
+        found[f"ground, slope {low:g}–{high:g}°"] = chosen
+    return found
+
+
+# -------------------------------------------------------------------------------------- the verdict
 
 BLOCK = 512  # cells of a window
 PARTS = 48  # windows that the registration sees, about
@@ -66,14 +179,6 @@ class Verdict:
         }
 
 
-def _windows(shape: tuple[int, int], side: int) -> list[tuple[slice, slice]]:
-    return [
-        (slice(r, min(r + side, shape[0])), slice(c, min(c + side, shape[1])))
-        for r in range(0, shape[0], side)
-        for c in range(0, shape[1], side)
-    ]
-
-
 def _read(model: HeightRaster, rows: slice, cols: slice, margin_m: float) -> Window:
     """The model's heights in a window and around it."""
     more = [int(np.ceil(margin_m / step)) + 2 for step in model.cell_m[::-1]]
@@ -84,7 +189,7 @@ def _read(model: HeightRaster, rows: slice, cols: slice, margin_m: float) -> Win
 def _parts(model: HeightRaster, reference: Reference, step_m: float) -> Iterator[tuple[Part, int]]:
     """Windows of the model with the reference's solid points, spread over it, and their groups."""
     side = int(np.clip(np.sqrt(model.shape[0] * model.shape[1] / PARTS), 24, BLOCK))
-    windows = _windows(model.shape, side)
+    windows = blocks(model.shape, side)
     rng = np.random.default_rng(0)
     if len(windows) > 2 * PARTS:
         windows = [windows[k] for k in sorted(rng.choice(len(windows), PARTS, replace=False))]
@@ -137,7 +242,7 @@ def score_surface_model(
     margin = REACH_M + abs(found.east_m) + abs(found.north_m)
     along, across = np.linalg.solve(model.to_enu, [found.east_m, found.north_m])
 
-    windows = _windows(model.shape, BLOCK)
+    windows = blocks(model.shape, BLOCK)
     for window in progress(windows, len(windows), "surface model judged"):
         lattice = lattice_of(reference, model, *window, step_m, AROUND_M)
         heights = _read(model, *window, margin + 4.0)
@@ -163,3 +268,105 @@ def score_surface_model(
     with np.errstate(invalid="ignore", divide="ignore"):
         differences = (sums[0] / sums[1]).astype(np.float32)
     return Verdict(model, reference, found, delivered, registered, edges, differences)
+
+
+# ----------------------------------------------------------------------------------------- the page
+
+MAP_BYTES = 250_000
+MAP_PX = 700
+TEMPLATE = Path(__file__).with_name("page.html.jinja")
+
+
+def describe(figures: dict[str, Any]) -> str:
+    """The verdict in one line."""
+    moved, edges, errors = figures["registration"], figures["edges"], figures["errors"][OPEN]
+    text = (
+        f"{moved['east_m']:+.2f} m east, {moved['north_m']:+.2f} m north, {moved['up_m']:+.2f} m "
+        f"up of its reference; then {errors['mean_absolute_m']:.2f} m mean absolute error {OPEN}, "
+        f"{100 * errors['known_share']:.1f} % known"
+    )
+    if edges["position_error_m"] is not None:
+        text += f"; edges of roofs {edges['position_error_m']:.2f} m off"
+    return minus(text)
+
+
+def write_verdict(
+    verdict: Verdict, folder: str | Path, title: str, *, index: str | Path | None = None
+) -> dict[str, Any]:
+    """Write the folder, whole or not at all; returns what stands in ``scores.json``.
+
+    ``index``: the page of all pages, for a link.
+    """
+    figures = verdict.figures()
+    rows = [{"stratum": name, **of} for name, of in figures["errors"].items() if of["points"]]
+    rows.append({"stratum": "as delivered, all but trees and water", **figures["as_delivered"]})
+    with atomic_folder(folder) as scratch:
+        write_json(scratch / "scores.json", figures)
+        write_table(scratch / "errors.csv", rows)
+        values = _values(verdict, figures, rows)
+        values |= {"title": title, "index": way(Path(folder) / "index.html", index)}
+        write_page(scratch / "index.html", TEMPLATE, values)
+    return figures
+
+
+@styled
+def _profile(profile: list[float | None]) -> Chart:
+    """The mean profile of the roofs' edges beside a sharp one."""
+    plot = Plot.of("mean profile of the edges", "Beside a sharp edge (grey).", (5.6, 3.2))
+    plot.axis.step(S, SHARP, where="mid", color=AXES)
+    values = [np.nan if v is None else v for v in profile]
+    (line,) = plot.axis.plot(S, values, marker=".", color=SERIES[0])
+    known = [(s, v) for s, v in zip(S, values) if np.isfinite(v)]
+    plot.hover(line, ["surface model"])
+    plot.axis.set_xlabel("outward of the edge, m")
+    plot.axis.set_ylabel(f"share of the step, {LOW:.0%} to {HIGH:.0%}")
+    return plot.chart([{"outward_m": float(s), "share": v} for s, v in known])
+
+
+def _shaded(model: HeightRaster) -> Picture:
+    """Hillshade of the model, read at ``MAP_PX`` along its longer side."""
+    heights, times = model.decimated(MAP_PX)
+    return hillshade(heights / (times * np.mean(model.cell_m)), 1.0)
+
+
+def _limit(verdict: Verdict) -> float:
+    """Ends of the map's colours, m: what nine tenths of the differences keep, 0.5 at least."""
+    size = np.abs(verdict.differences[np.isfinite(verdict.differences)])
+    return max(float(np.ceil(20 * np.percentile(size, 90)) / 20), 0.5) if size.size else 0.5
+
+
+def _values(
+    verdict: Verdict, figures: dict[str, Any], rows: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """What the page shows."""
+    limit = _limit(verdict)
+    picture = colours(verdict.differences, (-limit, limit), DIFFERENCES)
+    return {
+        "figures": figures,
+        "links": [(name, name, "") for name in ("scores.json", "errors.csv")],
+        "registration": _registration(figures["registration"]),
+        "edges": figures["edges"],
+        "table": table([texts(row) for row in rows]),
+        "shaded": encode(_shaded(verdict.model), MAP_BYTES),
+        "map": encode(shrink(picture, MAP_PX), MAP_BYTES),
+        "profile": _profile(figures["edge_profile"]),
+        "scale": Scale.of(DIFFERENCES, f"−{limit:.2f} m", f"+{limit:.2f} m"),
+        "line": describe(figures),
+    }
+
+
+def _registration(found: dict[str, Any]) -> list[Headline]:
+    """What is said of the model's place, with its standard uncertainty."""
+    figures = (
+        ("moved east", "east_m", "m"),
+        ("moved north", "north_m", "m"),
+        ("moved up", "up_m", "m"),
+        ("tilt along east", "tilt_east_m_per_km", "m/km"),
+        ("tilt along north", "tilt_north_m_per_km", "m/km"),
+    )
+    cards = []
+    for title, name, unit in figures:
+        sigma = found[f"sigma_{name}"]
+        note = "" if sigma is None else f"± {sigma:.3f} {unit}"
+        cards.append(Headline(title, minus(f"{found[name]:+.3f} {unit}"), note))
+    return cards

@@ -14,8 +14,6 @@ from stereotruth.evaluate.labels_against_truth import Comparison, SceneCompariso
 from stereotruth.evaluate.report.index_page import pages_of, pages_with, write_index
 from stereotruth.pages.page import INDEX
 
-from ....browser import look, needs_chromium
-
 EXPORT = {
     "size_px": 256,
     "labelled_pairs": 4,
@@ -46,7 +44,7 @@ def folder(tmp_path):
     put(tmp_path / "tiles/A b/export.json", json.dumps(EXPORT))
     put(tmp_path / "tiles/A b/manifest.csv", "tile\n")
     truth = SceneComparison("A b")
-    truth.all_tiles.parts["ground"] = Comparison(("no_points", "labelled"))
+    truth.all_tiles.parts["ground"] = Comparison()
     truth.all_tiles.parts["ground"].errors.add(np.array([0.0114, -0.0314]))
     put(tmp_path / "results/evaluate/A b/truth.json", json.dumps(truth.figures()))
     for name, epe in (("sgm", 1.25), ("net", 0.5)):
@@ -86,13 +84,6 @@ def test_every_link_leads_to_a_page_or_a_file(folder):
     assert any(link.startswith("https://doi.org/") for link in links)
 
 
-def test_pages_of_another_making_are_listed_without_figures(tmp_path):
-    put(tmp_path / "audit/theirs/index.html", "")
-    put(tmp_path / "results/report/B/index.html", "")
-    text = write_index(tmp_path).read_text()
-    assert "theirs" in text and ">B</a>" in text
-
-
 def test_without_pages_there_is_no_index(tmp_path):
     put(tmp_path / INDEX, "of pages that were deleted since")
     assert write_index(tmp_path) is None
@@ -112,11 +103,3 @@ def test_pages_are_found_and_chosen(tmp_path, monkeypatch):
     assert pages_with(["A"]) == there[1:]
     with pytest.raises(InputError, match="no page of B"):
         pages_with(["B"])
-
-
-@needs_chromium
-def test_it_asks_for_nothing_and_fits_its_window(folder, tmp_path):
-    wide = "return document.documentElement.scrollWidth - innerWidth"
-    seen = look(write_index(folder), tmp_path, wide, 390)
-    assert seen.wrong == [] and seen.requests == []
-    assert seen.found <= 0

@@ -13,7 +13,6 @@ from stereotruth.core.numerics.geometry import metres_per_degree
 from stereotruth.evaluate.report.site_page import write_site_page
 from stereotruth.sensor.site_pairs import rate
 
-from ....browser import look, needs_chromium
 from ....synthetic.site_sensors import exact_image
 
 SITE = drawn_site(3, 11, images=3, side_px=160)
@@ -85,21 +84,7 @@ def test_the_map_has_true_proportions(tmp_path):
     np.testing.assert_allclose(drawn, sides * scale, atol=0.02 * np.abs(drawn).max())
 
 
-def test_sections_without_input_are_left_out(tmp_path):
-    text = written(tmp_path, {}, {}, None).read_text()
-    assert re.findall(r'<section id="(\w+)"', text) == ["map", "images", "pairs"]
-    assert "in the table alone: 2." in text
-
-
 def test_images_that_no_scene_uses_are_named(tmp_path):
     assert "<li>1 image in no pair: C</li>" in written(tmp_path, {}, {}, None).read_text()
     linked = written(tmp_path, {}, {}, None, SCENES | {"A-C": ("A", "C")}).read_text()
     assert 'class="alarm"' not in linked
-
-
-@needs_chromium
-def test_nothing_sticks_out_of_the_page(tmp_path):
-    page = written(tmp_path, ADJUSTED, CLOSURE, None)
-    script = "return document.documentElement.scrollWidth - innerWidth"
-    seen = look(page, tmp_path, script, 390)
-    assert seen.wrong == [] and seen.requests == [] and seen.found <= 0

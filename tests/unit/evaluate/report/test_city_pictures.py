@@ -1,4 +1,4 @@
-"""The map of tiles on the ground, histograms, calibration: marks are where the values are."""
+"""Charts of a city's page and pictures of its tiles: marks and colours are where the values are."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ import io
 import re
 
 import numpy as np
+import pytest
 
-from stereotruth.evaluate.report.maps import calibration, histograms, tile_map
-from stereotruth.tiles.quick_looks import feature, write_footprints
+from stereotruth.evaluate.report import city_pictures
+from stereotruth.evaluate.report.city_pictures import histograms, tile_map
+from stereotruth.pages.pictures import NO_VALUE
+from stereotruth.tiles.quick_looks import feature, status_colours, write_footprints
+
+from ....synthetic.reported_city import FLAGS, SHIFT, SIZE, picture, write_city
 
 LAT = 45.0
 
@@ -56,12 +61,32 @@ def test_histograms_count_what_they_are_given_on_one_axis():
     assert histograms("h", {"train": {}}) is None
 
 
-def test_calibration_has_a_mark_for_each_group():
-    groups = [
-        {"mean_uncertainty": s, "share_below_1": a, "share_below_2": 0.9}
-        for s, a in ((0.1, 0.5), (0.4, 0.7))
-    ]
-    chart = calibration(groups, "caption")
-    once = re.findall(r'y="([\d.]+)"[^>]*><title>[^<]*below once', chart.svg)
-    assert len(once) == 2 and float(once[1]) < float(once[0])  # a larger share stands higher
-    assert calibration([], "") is None
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+LARGE = SIZE, 10**6
+LIMITS_PX = 0.0, 20.0
+
+
+def test_the_right_image_warps_onto_the_left_and_leaves_no_difference(tmp_path):
+    rows = write_city(tmp_path, 1)
+    made = city_pictures.tile_pictures(
+        tmp_path, rows[0], thumbnail=(SIZE, 10**6), large=LARGE, limits_px=LIMITS_PX
+    )
+    counts = city_pictures.disparity_counts(tmp_path, rows[0])
+    assert counts == {SHIFT: SIZE**2 - 600}
+    assert city_pictures.disparity_limits([counts, {40: 1}]) == (SHIFT, SHIFT + 1)
+    assert tuple(made.layers) == city_pictures.LARGE
+    assert made.disparity_px == (SHIFT, SHIFT)
+    assert made.correlation == pytest.approx(1.0)
+    left, warped = (picture(made.layers[name].uri) for name in ("left", "warped right"))
+    inner = np.s_[40:, 2 * SHIFT : -SHIFT]
+    assert np.abs(left - warped)[inner].mean() < 3  # grey values: compression
+    assert left[inner].std() > 20
+    difference = picture(made.layers["left − warped right"].uri)
+    assert difference[inner].min() > 235
+    assert np.abs(warped[15:25, 26:44] - city_pictures.NO_MATCH).max() < 25
+    assert np.abs(difference[15:25, 26:44] - NO_VALUE).max() < 25
+    status = picture(made.uris["status"])
+    colours = status_colours(list(FLAGS.values()))
+    for place, name in ((status[60:, 60:], "labelled"), (status[15:25, 26:44], "a_new_reason")):
+        assert np.abs(place - tuple(bytes.fromhex(colours[name][1:]))).max() < 25

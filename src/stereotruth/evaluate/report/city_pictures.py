@@ -1,20 +1,26 @@
-"""Charts of a city's page: tiles on the ground, disparities, stated uncertainties held to truth."""
+"""Charts of a city's page, and pictures of its tiles as data URIs of a given number of bytes."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pyproj
 import rasterio
+from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
 
+from ...core.products.rasters import read_flags, read_image, read_tile
+from ...pages import pictures
 from ...pages.figures import AXES, Chart, Plot, look, on_the_ground, styled
-from ...pages.pictures import SERIES, shrink
+from ...pages.pictures import SERIES, Layer, Picture, Scale, encode, hillshade, shrink
 from ...pages.tables import minus, missed
-from ...tiles.quick_looks import SPLIT_COLOURS, read_footprints
+from ...tiles.quick_looks import SPLIT_COLOURS, read_footprints, status_colours
+from ...tiles.tile_checks import warp_tile
 
 PICTURE_PX = 1000
 MARGIN = 0.03  # of the longer side, around all footprints
@@ -65,7 +71,7 @@ def tile_map(
         x, y = placed[row["tile"]] - west_south[:, None]
         complete, bad = row["complete"] == "yes", bool(missed(row))
         colour = SPLIT_COLOURS.get(row["split"], SPLIT_COLOURS["none"]) if complete else AXES
-        (shape,) = plot.axis.fill(x, y, facecolor=(*_rgb(colour), 0.25 if complete else 0.0))
+        (shape,) = plot.axis.fill(x, y, facecolor=(*to_rgb(colour), 0.25 if complete else 0.0))
         shape.set(edgecolor="#c0280c" if bad else colour, linewidth=2.5 if bad else 1.5)
         shape.set_linestyle(":" if bad else "-" if complete else "--")
         text = f"{row['tile']}: {row['split']}" + (", misses a limit of quality" if bad else "")
@@ -79,10 +85,6 @@ def tile_map(
     plot.axis.set(xlim=(0, east), ylim=(0, north))
     on_the_ground(plot.axis)
     return plot.chart([{k: row[k] for k in ("tile", "scene", "split", "complete")} for row in rows])
-
-
-def _rgb(colour: str) -> tuple[float, ...]:
-    return tuple(value / 255 for value in bytes.fromhex(colour[1:]))
 
 
 def _crs(looks: Sequence[Path], rings: Iterable[np.ndarray]) -> pyproj.CRS:
@@ -106,9 +108,7 @@ def histograms(title: str, counted: Mapping[str, Mapping[int, int]]) -> Chart | 
     total = sum((Counter(counts) for counts in counted.values()), Counter())
     if not total:
         return None
-    values = np.array(sorted(total))
-    share = np.cumsum([total[v] for v in values.tolist()]) / total.total()
-    low, high = values[np.searchsorted(share, (0.001, 0.999))] + np.array([0, 1])
+    low, high = _bounds(total, 0.001)
     step = max(1, math.ceil((high - low) / BARS))
     edges = np.arange(low, high + step, step)
     plot = Plot.of(
@@ -162,3 +162,145 @@ def calibration(deciles: Sequence[Mapping[str, float]], caption: str) -> Chart |
     plot.axis.set_ylim(0, 103)
     plot.axis.legend(loc="lower right")
     return plot.chart(deciles)
+
+
+NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
+GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen
+DIFFERENCE = 0.12  # of the left image's contrast, at the ends of the colours of a difference
+
+
+LARGE = ("left", "warped right", "left − warped right", "disparity", "hillshade")
+
+
+@dataclass
+class TilePictures:
+    """Data URIs of a tile's thumbnails by name, and what they show.
+
+    ``disparity_px``: percentiles 1 and 99 of the labels; ``layers``: large pictures, ``LARGE``, to
+    be laid over each other; ``correlation`` of left and warped right image.
+    """
+
+    uris: dict[str, str]
+    disparity_px: tuple[float, float] | None = None
+    layers: dict[str, Layer] = field(default_factory=dict)
+    correlation: float | None = None
+
+
+def disparity_counts(folder: Path, row: Mapping[str, str]) -> Counter[int]:
+    """Labels of a tile by whole px of disparity; none of a pair without labels."""
+    if not row.get("disp"):
+        return Counter()
+    disparity = read_tile(folder / row["disp"])
+    values, counts = np.unique(
+        np.floor(disparity[np.isfinite(disparity)]).astype(int), return_counts=True
+    )
+    return Counter(dict(zip(values.tolist(), counts.tolist())))
+
+
+def disparity_limits(counted: Iterable[Mapping[int, int]]) -> tuple[float, float] | None:
+    """The whole px that hold all labels of all tiles but a hundredth at either end."""
+    total = sum(map(Counter, counted), Counter())
+    return _bounds(total, 0.01) if total else None
+
+
+def _bounds(counts: Counter[int], beyond: float) -> tuple[int, int]:
+    """The whole px that hold all that is counted but a share at either end."""
+    values = np.array(sorted(counts))
+    share = np.cumsum([counts[v] for v in values.tolist()]) / counts.total()
+    low, high = values[np.searchsorted(share, (beyond, 1 - beyond))].tolist()
+    return low, high + 1
+
+
+def _shown(image: NDArray[np.float64], limits: tuple[float, float]) -> Picture:
+    lut = np.rint(255.0 * np.linspace(0, 1, 256) ** GAMMA).astype(np.uint8)
+    return lut[pictures.stretch(image, limits=limits)]
+
+
+def _limits(image: NDArray[np.float64]) -> tuple[float, float]:
+    """Percentiles 1 and 99 of what is known."""
+    known = image[np.isfinite(image) & (image != 0)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = np.percentile(known, (1, 99))
+    return float(low), float(high)
+
+
+def tile_pictures(
+    folder: str | Path,
+    row: Mapping[str, str],
+    *,
+    thumbnail: tuple[int, int],
+    large: tuple[int, int] | None,
+    limits_px: tuple[float, float] | None,
+    base_to_height: float = 1.0,
+) -> TilePictures:
+    """The pictures of one tile; ``row`` is its line of the manifest in ``folder``.
+
+    ``thumbnail``, ``large``: longer side in px and bytes of each picture; without ``large`` there
+    are no ``layers``. A pair without labels has its images only. ``limits_px``: of the colours of
+    disparity; ``base_to_height``: px of disparity for a px of height.
+    """
+    folder = Path(folder)
+    side, size = thumbnail
+    left, right = (read_image(folder / row[kind]).astype(np.float64) for kind in ("left", "right"))
+    result = TilePictures({})
+    for name, image in (("left", left), ("right", right)):
+        shown = _shown(image, _limits(image))
+        result.uris[name] = encode(pictures.shrink(shown, side), size)
+    if row.get("status"):
+        status, names = read_flags(folder / row["status"])
+        colours = status_colours(list(names.values()))
+        table = np.zeros((256, 3), np.uint8)
+        for value, name in names.items():
+            table[value] = tuple(bytes.fromhex(colours[name][1:]))
+        result.uris["status"] = encode(pictures.shrink(table[status], side), size)
+    if not row.get("disp"):
+        return result
+    disparity = read_tile(folder / row["disp"])
+    known = disparity[np.isfinite(disparity)]
+    if not known.size:
+        return result
+    low, high = (float(v) for v in np.percentile(known, (1, 99)))
+    result.disparity_px = low, high
+    coloured = pictures.colours(disparity, limits_px)
+    result.uris["disparity"] = encode(pictures.shrink(coloured, side), size)
+    if large is not None and limits_px is not None:
+        ends = (minus(f"{value:.0f} px") for value in limits_px)
+        layers = {
+            "disparity": (coloured, Scale.of(pictures.DISPARITIES, *ends)),
+            "hillshade": (hillshade(disparity, base_to_height), None),
+        }
+        _add_large(result, folder, row, large, layers)
+    return result
+
+
+def _add_large(
+    result: TilePictures,
+    folder: Path,
+    row: Mapping[str, str],
+    large: tuple[int, int],
+    layers: Mapping[str, tuple[Picture, Scale | None]],
+) -> None:
+    """Add the large pictures: left, warped, difference, and the ``layers``."""
+    tile = warp_tile(folder, row)
+    low, high = _limits(tile.left)
+    matched = tile.sums.match(tile.warped)
+    nothing = ~np.isfinite(matched)
+    spread = max(DIFFERENCE * (high - low), 1e-9)
+    warped = np.repeat(_shown(np.nan_to_num(matched), (low, high))[..., None], 3, axis=2)
+    warped[nothing] = NO_MATCH
+    difference = pictures.colours(tile.left - matched, (-spread, spread), pictures.DIFFERENCES)
+    scale = Scale.of(pictures.DIFFERENCES, f"−{spread:.0f} DN", f"+{spread:.0f} DN")
+    made = {
+        "left": (_shown(tile.left, (low, high)), None),
+        "warped right": (warped, None),
+        "left − warped right": (difference, scale),
+        **layers,
+    }
+    side, limit = large
+    result.layers = {
+        name: Layer(encode(pictures.shrink(picture, side), limit), scale)
+        for name, (picture, scale) in made.items()
+    }
+    correlation = tile.sums.coefficient
+    result.correlation = correlation if np.isfinite(correlation) else None

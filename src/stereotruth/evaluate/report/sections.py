@@ -1,4 +1,4 @@
-"""The figures on top of a city's page, most important first; the page folds all but six.
+"""What a city's page says in figures: those on top, of which it folds all but six, and tables.
 
 What images and control points say of a scene is as ``export.json`` has it and as the last lines of
 a run print it: over all matches and all labelled pixels of a scene. More of it is in the tables.
@@ -12,13 +12,31 @@ from typing import Any
 
 import numpy as np
 
-from ...pages.tables import Headline, joined, metres, minus, missed, number, spread
+from ...pages.tables import (
+    Headline,
+    Table,
+    cells_of,
+    columns_of,
+    joined,
+    limit,
+    metres,
+    minus,
+    missed,
+    number,
+    spread,
+    table,
+    texts,
+    words,
+)
 from ...tiles.label_doubts import ABOUT, ALIGNMENT, LIDAR
 from ...tiles.manifest import NONE, SPLITS
 from ...tiles.sift_matches import SIFT_NOISE_PX
+from .city_pictures import calibration
 
 Rows = Sequence[Mapping[str, str]]
-Records = Mapping[str, Mapping[str, Any]]
+Record = Mapping[str, Any]
+Records = Mapping[str, Record]
+Row = Mapping[str, str]
 
 
 def headlines(
@@ -156,18 +174,17 @@ def _pairs(rows: Rows, labelled: Rows) -> Headline:
     return Headline("labelled pairs", str(len(labelled)), note)
 
 
-def _is_told(doubt: Mapping[str, Any]) -> bool:
-    """Whether alignment or LiDAR doubt labels by more than these state."""
-    return doubt.get("of") in (ALIGNMENT, LIDAR) and not doubt["explained_by_alignment"]
-
-
 def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
     bad = sum(bool(missed(row)) for row in labelled)
     scenes = [scene for scene, of in quality.get("scenes", {}).items() if missed(of)]
     note = f"and {', '.join(scenes)} as a whole" if scenes else ""
     doubts = quality.get("doubts", {})
     doubted = [s for s, of in doubts.items() if any(d.get("of") not in ABOUT for d in of)]
-    told = [s for s, of in doubts.items() if any(map(_is_told, of))]
+    told = [  # where alignment or LiDAR doubt labels by more than these state
+        scene
+        for scene, of in doubts.items()
+        if any(d.get("of") in (ALIGNMENT, LIDAR) and not d["explained_by_alignment"] for d in of)
+    ]
     if doubted:
         note = joined(note, f"images and labels disagree in {', '.join(doubted)}")
     if told:
@@ -205,3 +222,134 @@ def _gcps(alignments: Records, refined: Records) -> Headline:
     if refined:
         note += f", {rms(refined, 'after')} px after refinement"
     return Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note)
+
+
+# ------------------------------------------------------------------------- tables of sections
+
+# Table 4 of the paper: (city, class), pairs, matches, mean of mean errors and of mean absolute
+# errors in px.
+PUBLISHED = (
+    ("Kunming", "building", 36, 3576, -0.69, 0.48),
+    ("Kunming", "vegetation", 216, 54838, -0.869, 0.66),
+    ("Qichun", "building", 128, 16643, -0.11, 0.51),
+    ("Qichun", "vegetation", 736, 99457, -0.5, 0.79),
+    ("Yingde", "building", 90, 13969, 0.09, 0.58),
+    ("Yingde", "vegetation", 438, 63226, 0.11, 0.73),
+    ("Shaoguan", "building", 77, 6744, -0.24, 0.42),
+    ("Wuhan", "building", 20, 1776, -0.37, 0.49),
+    ("Hengyang", "building", 22, 1139, -0.03, 0.32),
+    ("US3D", "building", 49, 3750, -0.20, 0.89),
+)
+
+
+def residuals(record: Record, later: Record) -> dict[str, Any]:
+    """Of a scene: model, warnings, a table of the points, and what a refinement did."""
+    points = []
+    for view in ("left", "right"):
+        for point in record.get(view, {}).get("gcps", []):
+            row = {"image": view, "GCP": point["id"]}
+            for which in ("before", "after", "leave_one_out"):
+                pair = point.get(which, [None])
+                row[f"{which}_px"] = "" if None in pair else f"{np.hypot(*pair):.3f}"
+            used = "yes" if point.get("used", True) else "no"
+            points.append(row | {"used": used, "reason": point.get("reason", "")})
+    found = later.get("refinement", {})
+    ties = [
+        {
+            "tie points": f"{words(name)} {when}",
+            **{f"{k}_px": f"{v:.4f}" for k, v in values.items() if isinstance(v, int | float)},
+        }
+        for name in ("disparity", "y_parallax")
+        for when in ("before", "after")
+        if (values := found.get(when, {}).get(name))
+    ]
+    return {
+        "model": record.get("model", ""),
+        "warnings": list(dict.fromkeys([*record.get("warnings", []), *later.get("warnings", [])])),
+        "points": table(points),
+        "refinement": found,
+        "ties": table(ties),
+    }
+
+
+def table4_beside_the_paper(rows: Rows) -> Table | None:
+    """This run's rows of the paper's Table 4 above the published ones, in its columns first."""
+    if not rows:
+        return None
+    names = list(rows[0])
+    ours = tuple(cells_of(names, row) for row in rows)
+    published = tuple(
+        cells_of(names, dict(zip(names, [f"{name} ({kind})", *map(str, numbers)])))
+        for name, kind, *numbers in PUBLISHED
+    )
+    groups = (("this run", ours), ("published: Li et al. 2023, table 4", published))
+    return Table(columns_of(names, rows), groups)
+
+
+def exact_truth(rows: Rows, record: Record) -> dict[str, Any] | None:
+    """Figures of scenes and surfaces, of each tile, by status, and of the uncertainty."""
+    if not rows:
+        return None
+    of_tiles = record.get("exported_tiles", {})
+    groups = of_tiles.get("status", {})
+    names = list(dict.fromkeys(name for counts in groups.values() for name in counts))
+    by_status = [
+        {"pixels that are": words(group), "count": str(total)}
+        | {f"share_{name}": f"{counts.get(name, 0) / total:.6f}" for name in names}
+        for group, counts in groups.items()
+        if (total := sum(counts.values()))
+    ]
+    stated = of_tiles.get("calibration", {})
+    caption = "Errors below once and twice their uncertainty; dashed: where it is right."
+    if stated.get("share_below_1") is not None:
+        caption += (
+            f" {100 * stated['share_below_1']:.1f} % of all are below their uncertainty (68.3 % is "
+            f"right), {100 * stated['share_below_2']:.1f} % below twice theirs (95.4 %)."
+        )
+    meaning = record.get("meaning", {})
+    return {
+        "whole": table([r for r in rows if not r["scope"].startswith("tile ")]),
+        "tiles": table([r for r in rows if r["scope"].startswith("tile ")]),
+        "status": table(by_status),
+        "calibration": calibration(stated.get("deciles", []), caption),
+        "meaning": {words(k): v for k, v in meaning.items() if isinstance(v, str)},
+    }
+
+
+def quality_gates(record: Record) -> dict[str, Any] | None:
+    """The limits of the gates, the figures of each scene with the gates that it misses, doubts.
+
+    And what the images say of the labels of each scene, by surface.
+    """
+    scenes = record.get("scenes", {})
+    if not scenes:
+        return None
+    rows = [{"scene": scene, **texts(figures)} for scene, figures in scenes.items()]
+    shown = [
+        name
+        for name in dict.fromkeys(["scene", "quality", *rows[0]])
+        if name != "lidar" and any(row.get(name) for row in rows)  # what was read has its own card
+    ]
+    return {
+        "table": table(rows, shown),
+        "limits": [limit(name, v) for name, v in record.get("limits", {}).items() if v is not None],
+        "doubts": [
+            f"{scene}: {doubt['text']}"
+            for scene, found in record.get("doubts", {}).items()
+            for doubt in found
+        ],
+        "strips": table(
+            [
+                {"scene": scene, **texts(row)}
+                for scene, figures in scenes.items()
+                for row in ((figures.get("lidar") or {}).get("strips") or {}).get("strips", ())
+            ]
+        ),
+        "surfaces": table(
+            [
+                {"scene": scene, "of": words(of), **texts(figures)}
+                for scene, by in record.get("surfaces", {}).items()
+                for of, figures in by.items()
+            ]
+        ),
+    }

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from stereotruth.evaluate.report.headlines import headlines
+from stereotruth.evaluate.report.sections import headlines
 from stereotruth.tiles.tile_checks import summary_lines
 
 SCENE = {
@@ -59,24 +59,6 @@ def test_what_the_images_say_is_one_number_on_the_page_and_in_the_terminal():
     assert "1315 matches" in found["SIFT disparity − label"].note
 
 
-def test_several_scenes_have_their_range():
-    other = SCENE | {"sift_mean_absolute_error_px": 0.31, "sift_matches": 85}
-    card = cards({"A-1": SCENE, "A-2": other}, height=2.0)["SIFT disparity − label"]
-    assert card.value == "0.24–0.31 px"
-    assert card.note == (
-        "2 scenes; 1400 matches, mean absolute; about 0.18 px of it SIFT's own; ≤ 0.62 m of height"
-    )
-
-
-def test_metres_stand_beside_px_where_the_geometry_is_known():
-    truth = [{"scope": "tiles", "mean_absolute_px": "0.021"}]
-    found = cards({"A-1": SCENE}, height=1.03, truth=truth)
-    assert found["SIFT disparity − label"].note.endswith("0.25 m of height")
-    assert found["error against the truth"].note == "mean absolute; 0.022 m of height"
-    assert found["disparities"].note == "40 m of height"
-    assert cards({"A-1": SCENE})["disparities"].note == "of the tiles"
-
-
 def test_how_well_labels_are_known_comes_first_with_the_surfaces():
     by = {
         "all": {"uncertainty_median_px": 0.0412, "uncertainty_p95_px": 0.104},
@@ -88,20 +70,6 @@ def test_how_well_labels_are_known_comes_first_with_the_surfaces():
     assert (known.title, known.value) == ("labels known to", "0.041 px")
     assert "0.1 px for 95 %" in known.note and "open ground 0.03" in known.note
     assert exact.value == "0.021 px"
-
-
-def test_a_missed_gate_is_among_the_first_six():
-    found = headlines(
-        [ROW | {"quality": "max_sift_error_px"}], {}, {}, [], {"quality": {"scenes": {}}}
-    )
-    assert any(card.bad for card in found[:6])
-
-
-def test_density_is_that_of_the_scenes():
-    assert "LiDAR density" not in cards({"A-1": SCENE})
-    dense, sparse = (SCENE | {"lidar_points_per_m2": value} for value in (10.84, 0.5))
-    assert cards({"A-1": dense})["LiDAR density"].value == "11 points/m²"
-    assert cards({"A-1": dense, "A-2": sparse})["LiDAR density"].value == "0.5–11 points/m²"
 
 
 LIDAR = {
@@ -118,10 +86,7 @@ LIDAR = {
 @pytest.mark.parametrize(
     ("left", "right", "said"),
     [
-        ("", "", ""),
-        ("12", "", "images 12 days later"),
         ("365", "12", "images 12–365 days later"),
-        ("-7", "-7", "images 7 days earlier"),
         ("-7", "30", "images from 7 days earlier to 30 days later"),
     ],
 )
@@ -129,17 +94,6 @@ def test_days_from_the_lidar_to_the_images_stand_beside_its_own(left, right, sai
     row = ROW | {"lidar_days_left": left, "lidar_days_right": right}
     card = cards({"A-1": SCENE | {"lidar": LIDAR}}, rows=[row, ROW])["LiDAR measured"]
     assert (card.value, card.note) == ("2019-05-04 to 2019-05-09", said)
-
-
-def test_a_doubt_stands_with_the_gates():
-    quality = {"scenes": {"A-1": SCENE}, "doubts": {"A-1": [{"text": "images say so"}]}}
-    (gates,) = (
-        c
-        for c in headlines([ROW], {}, {}, [], {"quality": quality})
-        if c.title == "limits of quality"
-    )
-    assert gates.bad
-    assert "images and labels disagree in A-1" in gates.note
 
 
 def test_what_alignment_and_lidar_doubt_stands_there_too():

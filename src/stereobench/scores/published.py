@@ -1,0 +1,155 @@
+"""What others have published of methods, to stand beside one's own scores, and what is known of
+the training of methods.
+
+The paper's results (section V) are on the real WHU-Stereo, by methods trained on it. EPE in px, D1
+(3 px) in percent, milliseconds per pair of 1024 × 1024 px; keys are kinds of methods. Protocols of
+others are less than those here: each row says where it stands and what is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any
+
+from ..methods.kinds import KINDS, MCCNN
+
+TABLE5 = {
+    "sgm": (4.889, 50.79, 506),
+    "stereonet": (2.453, 25.12, 238),
+    "psmnet": (2.481, 24.81, 614),
+    "hmsmnet": (1.672, 12.94, 511),
+}
+TABLE6 = {
+    "Shaoguan": {
+        "sgm": (7.862, 63.19),
+        "stereonet": (2.660, 24.58),
+        "psmnet": (2.514, 21.45),
+        "hmsmnet": (2.091, 16.94),
+    },
+    "Kunming": {
+        "sgm": (3.065, 37.50),
+        "stereonet": (1.225, 6.09),
+        "psmnet": (1.181, 5.77),
+        "hmsmnet": (1.017, 4.44),
+    },
+    "Yingde": {
+        "sgm": (5.497, 47.22),
+        "stereonet": (1.821, 14.69),
+        "psmnet": (1.993, 15.09),
+        "hmsmnet": (1.436, 9.86),
+    },
+    "Qichun": {
+        "sgm": (4.484, 54.19),
+        "stereonet": (2.801, 34.63),
+        "psmnet": (2.953, 37.04),
+        "hmsmnet": (1.596, 13.65),
+    },
+    "Wuhan": {
+        "sgm": (6.790, 58.65),
+        "stereonet": (4.836, 47.83),
+        "psmnet": (4.105, 36.49),
+        "hmsmnet": (3.905, 35.66),
+    },
+    "Hengyang": {
+        "sgm": (9.081, 61.82),
+        "stereonet": (4.375, 43.50),
+        "psmnet": (3.761, 31.23),
+        "hmsmnet": (2.914, 23.43),
+    },
+}
+TABLE7 = {
+    "Shaoguan": {"stereonet": (2.467, 23.26), "psmnet": (2.366, 20.61), "hmsmnet": (1.928, 15.67)},
+    "Kunming": {"stereonet": (1.245, 6.19), "psmnet": (1.091, 4.86), "hmsmnet": (0.996, 5.05)},
+    "Yingde": {"stereonet": (1.758, 13.52), "psmnet": (1.481, 9.96), "hmsmnet": (1.351, 8.72)},
+    "Qichun": {"stereonet": (2.760, 34.07), "psmnet": (2.817, 35.05), "hmsmnet": (1.483, 12.09)},
+    "Wuhan": {"stereonet": (4.346, 42.88), "psmnet": (4.025, 34.92), "hmsmnet": (3.718, 34.51)},
+    "Hengyang": {"stereonet": (3.885, 39.18), "psmnet": (3.553, 34.85), "hmsmnet": (2.539, 19.62)},
+}
+
+PAPER = "Li et al., IEEE TGRS 2023, table 5"
+LATER = "READMEs of later networks"
+INVALID = "how pixels that SGM leaves invalid count, SGM's settings"
+LITTLE = "pair list, range, mask, pooling; whether trained and scored by one program"
+ORDER = f"{LITTLE}; the networks are taken to stand in the order of those of WHU-Stereo"
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published score: EPE in px, D1 (3 px) in percent, its source, and what that leaves open."""
+
+    method: str
+    epe_px: float
+    d1_percent: float
+    source: str
+    not_known: str
+
+
+def _paper(kind: str, epe: float, d1: float) -> Published:
+    lacking = "pair list; whether labels beyond the range count"
+    return Published(
+        KINDS[kind].label, epe, d1, PAPER, f"{lacking}; {INVALID}" if kind == "sgm" else lacking
+    )
+
+
+PUBLISHED = {
+    "whu-2023": (
+        *(_paper(kind, epe, d1) for kind, (epe, d1, _) in TABLE5.items()),
+        Published("TGRNet", 1.586, 12.63, LATER, LITTLE),
+        Published("RAFT-Stereo", 1.729, 14.12, LATER, LITTLE),
+        Published("HMSM-Net, again", 2.040, 19.00, LATER, f"{LITTLE}; why not the paper's 1.672"),
+    ),
+    "us3d-track2": (
+        Published("TGRNet", 1.313, 7.17, LATER, ORDER),
+        Published("RAFT-Stereo", 1.366, 7.72, LATER, ORDER),
+        Published("HMSM-Net", 1.473, 9.17, LATER, ORDER),
+    ),
+}
+
+
+# --------------------------------------------------------------------- what methods learnt from
+
+NOTHING = "nothing"
+NOT_STATED = "not stated"
+US3D = "US3D"  # the Data Fusion Contest of 2019
+TRAINING_COLUMNS = {
+    "trained_on": "trained on",
+    "licence": "licence",
+    "seen_in_training": "dataset seen in training",
+}
+
+
+def training_data(of: Mapping[str, Any]) -> dict[str, str]:
+    """The columns of TRAINING_COLUMNS for the summary of a method, ``scores.json``.
+
+    A method states ``trained_on`` in its entry. Known without that: methods that learn nothing,
+    MC-CNN, and networks that rule ``train`` trained, on the training pairs of a dataset.
+    """
+    dataset, settings = of["dataset"], of["settings"]
+    stated = list(settings.get("trained_on") or ())
+    own = _trained_here(settings)
+    if own:
+        stated.append(f"{own}, training pairs")
+    elif not stated and settings["kind"] == "pandora" and settings.get("pipeline") == MCCNN:
+        stated = [US3D]
+    licence = settings.get("licence") or (of.get("identity") or {}).get("licence") or NOT_STATED
+    if not stated:
+        learns = settings["kind"] not in ("sgm", "pandora") or settings.get("pipeline")
+        trained = NOT_STATED if learns else NOTHING
+        seen = NOT_STATED if learns else "no"
+    else:
+        trained = "; ".join(stated)
+        names = {name.casefold() for name in stated}
+        seen = "yes" if dataset.casefold() in names else "no"
+        if seen == "no" and own == dataset:
+            seen = "training pairs only"
+    return {"trained_on": trained, "licence": licence, "seen_in_training": seen}
+
+
+def _trained_here(settings: Mapping[str, Any]) -> str | None:
+    """The dataset that rule ``train`` trained a network on; None: weights from elsewhere."""
+    if not KINDS[settings["kind"]].is_network:
+        return None
+    parts = PurePath(settings.get("weights") or "").parts
+    return parts[2] if parts[:2] == ("results", "train") and len(parts) > 3 else None
