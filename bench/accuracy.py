@@ -21,7 +21,7 @@ from synthetic_pairs import label_by, labels_of
 
 from stereocities.cities import CITIES
 from stereotruth.align.align import align
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.core import sheets
 from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.config.section import merged

@@ -35,7 +35,7 @@ from stereocities.truth import SURFACES, truth_at
 from stereocities.twin_world import twin_city
 from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align, from_rpcs
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.align.refine import refine
 from stereotruth.core.config.labels import LabelSettings
 from stereotruth.core.numerics.error_sums import ErrorSum

@@ -31,14 +31,12 @@ from stereocities.site_images import (
     simulate_site_points,
 )
 from stereocities.sites import SiteSpec, drawn_site
-from stereotruth.align.adjustment import epipolar_model
+from stereotruth.align.adjustment import epipolar_model, write_equations
 from stereotruth.align.align import align, from_rpcs
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.align.gcp_checks import open_view
 from stereotruth.align.refine import refine
-from stereotruth.align.site_adjustment import adjust_site
-from stereotruth.align.site_pair import ScenePair, pair_alignment
-from stereotruth.align.tie_equations import write_equations
+from stereotruth.align.site_adjustment import ScenePair, adjust_site, pair_alignment
 from stereotruth.core.config.labels import LabelSettings
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import atomic_folder, write_table

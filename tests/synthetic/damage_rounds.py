@@ -34,9 +34,8 @@ from typing import Any
 
 import numpy as np
 
-from stereotruth.align.align import align
-from stereotruth.align.align_figure import draw_residuals
-from stereotruth.align.align_report import write_alignment
+from stereotruth.align.align import align, write_alignment
+from stereotruth.align.figures import draw_residuals
 from stereotruth.align.gcp_checks import open_view
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import in_own_process

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import link, read_perhaps_edited

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereotruth.align.align import align
-from stereotruth.align.align_figure import draw_residuals
+from stereotruth.align.figures import draw_residuals
 
 from ..synthetic import damage_rounds
 from ..synthetic.damage import BYTES, TEXT, damaged

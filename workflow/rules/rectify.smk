@@ -27,7 +27,7 @@ rule rectify:
         code=source_digest(
             "stereotruth.epipolar.rectify",
             "stereotruth.epipolar.fit",
-            "stereotruth.align.aligned_pair",
+            "stereotruth.align.alignment",
         ),
     message:
         "Making epipolar images of scene {wildcards.scene}"
@@ -62,7 +62,7 @@ rule rectify_strip:
         code=source_digest(
             "stereotruth.epipolar.rectify",
             "stereotruth.epipolar.fit",
-            "stereotruth.align.aligned_pair",
+            "stereotruth.align.alignment",
         ),
     message:
         "Making strip {wildcards.strip} of the epipolar images of scene {wildcards.scene}"

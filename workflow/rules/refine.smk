@@ -33,8 +33,8 @@ rule refine:
         bands=SETTINGS.rectify.model_dump(),
         code=source_digest(
             "stereotruth.align.refine",
-            "stereotruth.align.refine_report",
-            "stereotruth.align.tie_equations",
+            "stereotruth.align.refine",
+            "stereotruth.align.adjustment",
         ),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
@@ -67,7 +67,7 @@ rule draw_refinement:
     params:
         sources=upstream("draw_refinement"),
         script=content_of("../scripts/draw_refinement.py"),
-        code=source_digest("stereotruth.align.refine_figure"),
+        code=source_digest("stereotruth.align.figures"),
     message:
         "Drawing the tie points of scene {wildcards.scene}"
     script:

@@ -1,7 +1,7 @@
 """One scene's tie points of the refinement, drawn."""
 
-from stereotruth.align.aligned_pair import Alignment
-from stereotruth.align.refine_figure import draw_refinement
+from stereotruth.align.alignment import Alignment
+from stereotruth.align.figures import draw_refinement
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 

@@ -1,6 +1,6 @@
 """Heights, positions and classes of what an original image shows."""
 
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 from stereotruth.core.products.provenance import checksums, describe

@@ -1,6 +1,6 @@
 """One aligned pair to epipolar images."""
 
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.core.config.labels import Rectify
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making

@@ -1,6 +1,6 @@
 """One strip of an aligned pair to blocks of its epipolar images."""
 
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.core.config.labels import Rectify
 from stereotruth.core.job import job
 from stereotruth.core.products.grids import Strip

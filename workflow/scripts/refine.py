@@ -1,9 +1,9 @@
 """What is left between one scene's LiDAR and its two images, taken out of the alignment."""
 
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.align.refine import refine
-from stereotruth.align.refine_report import write_refinement
-from stereotruth.align.tie_equations import write_equations
+from stereotruth.align.refine import write_refinement
+from stereotruth.align.adjustment import write_equations
 from stereotruth.core.config.labels import Rectify
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making

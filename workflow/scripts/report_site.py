@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from stereotruth.align.site_images import GivenImage, open_image
+from stereotruth.align.images import GivenImage, open_image
 from stereotruth.core.job import job
 from stereotruth.core.products.files import read_json
 from stereotruth.core.products.making import making

@@ -10,6 +10,7 @@ WGS 84 longitude, latitude in degrees and ellipsoidal height in m.
 
 from __future__ import annotations
 
+import csv
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -21,24 +22,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.products.files import as_text, atomic_file
 from ..core.products.provenance import describe, source_digest
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..sensor.rpc import SensorModel
-from .aligned_pair import Alignment, GcpResidual, ViewFit
+from .alignment import Alignment, GcpResidual, ViewFit
 from .control_points import ControlPoints, read_gcps
 from .gcp_checks import (
+    BLUNDER_FLOOR,
+    MINIMAL,
+    System,
     View,
     check_frame,
     check_ground,
     check_heights,
     check_swapped,
+    find_blunders,
     footprint,
+    leave_one_out_residuals,
     open_view,
     refuse_fit,
     refuse_misfit,
     tilt,
 )
-from .robust_fit import BLUNDER_FLOOR, MINIMAL, System, find_blunders, leave_one_out_residuals
 
 log = logging.getLogger("stereotruth")
 Bools = NDArray[np.bool_]
@@ -347,3 +353,32 @@ def from_rpcs(
         warnings=(PLACES_BY_RPCS,),
         provenance=dict(provenance),
     )
+
+
+def write_alignment(alignment: Alignment, json_file: str | Path, csv_file: str | Path) -> None:
+    """Write the alignment (JSON) and the residuals of every GCP (CSV, px)."""
+    with atomic_file(csv_file) as scratch:
+        _write_table(alignment, scratch)
+    alignment.save(json_file)
+
+
+def _write_table(alignment: Alignment, path: Path) -> None:
+    pairs = ("measured", "predicted", "before", "after", "leave_one_out")
+    header = ["view", "id", "used", "lon_deg", "lat_deg", "height_m"]
+    header += [f"{name}_{axis}_px" for name in pairs for axis in ("col", "row")] + ["reason"]
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        for fit in alignment.fits:
+            for g in fit.gcps:
+                numbers = [f"{v:.4f}" for name in pairs for v in getattr(g, name)]
+                ground = [f"{g.lon:.10f}", f"{g.lat:.10f}", f"{g.height:.4f}"]
+                writer.writerow(
+                    [
+                        fit.view,
+                        as_text(g.id),
+                        "yes" if g.used else "no",
+                        *(*ground, *numbers),
+                        as_text(g.reason),
+                    ]
+                )

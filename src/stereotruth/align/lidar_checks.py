@@ -24,7 +24,7 @@ from ..lidar.point_store import PointStore, query_points
 from ..sensor.rpc import SensorModel
 from .adjustment import Estimate
 from .align import CAREFUL_SIGMA
-from .aligned_pair import Alignment, GcpResidual
+from .alignment import Alignment, GcpResidual
 
 Floats = NDArray[np.float64]
 

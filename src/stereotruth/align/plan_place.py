@@ -4,25 +4,101 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.numerics.degrees import metres_per_degree
 from ..lidar.point_store import PointStore, query_points
 from ..sensor.image_reader import Source
 from ..sensor.rpc import SensorModel
-from .adjustment import Estimate, parameters_of
-from .aligned_pair import Alignment, ViewFit, over_the_image
-from .edge_offsets import ROOF_RIM_M, PlanOffset, plan_offset
-from .equations import PlanObservation
-from .plan_frame import COMMON_M, OWN_M, PlanFrame, plan_slopes, with_offsets
-from .roof_edges import RoofEdges, find_roof_edges
+from .adjustment import Estimate, PlanObservation, parameters_of
+from .alignment import Alignment, ViewFit, over_the_image
+from .roof_edges import ROOF_RIM_M, PlanOffset, RoofEdges, find_roof_edges, plan_offset
 from .tie_sites import IS_FIRM, choose_sites, query_box
 
-log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
+
+
+COMMON_M = 0.25  # m, standard deviation of what all images see alike of roofs' edges: half a rim
+OWN_M = 0.1  # m: of what each sees by itself, besides the scatter of its edges
+SLOPES_SHARE = 1.0  # variance that matches on slopes share, by that which their scatter shows
+
+
+def plan_slopes(sensor: SensorModel, lon: float, lat: float, height: float) -> Floats:
+    """[2, 2] px: by how much (col, row) change for a metre to the east and to the north."""
+    step = 1.0 / metres_per_degree(lat)
+    here = np.array(sensor.project(lon, lat, height))
+    east, north = (
+        np.array(sensor.project(lon + d * step[0], lat + (1 - d) * step[1], height)) for d in (1, 0)
+    )
+    return np.column_stack([east - here, north - here])
+
+
+@dataclass(frozen=True, eq=False)
+class PlanFrame:
+    """What a metre of plan is to the parameters [6 n] of n images.
+
+    ``shift`` [6 n, 2]: change of the parameters that moves all images by a metre to the east, to
+    the north; ``mean`` [2, 6 n]: mean place of all images (m) by the parameters.
+    """
+
+    shift: Floats
+    mean: Floats
+
+    @classmethod
+    def of(cls, fits: Sequence[ViewFit], slopes: Sequence[Floats]) -> PlanFrame:
+        """Of images with ``slopes`` [2, 2] as of :func:`plan_slopes`, in their middles."""
+        count = 6 * len(fits)
+        shift, mean = np.zeros((count, 2)), np.zeros((2, count))
+        for k, (fit, px) in enumerate(zip(fits, slopes)):
+            cols, rows = fit.size
+            design = fit.design((cols - 1) / 2, (rows - 1) / 2)
+            shift[[6 * k + 2, 6 * k + 5]] = px
+            mean[:, 6 * k : 6 * k + 6] = np.linalg.solve(px, design) / len(fits)
+        return cls(shift, mean)
+
+    def widened(self, covariance: Floats, of_ties: Floats) -> Floats:
+        """The ``covariance`` with what tie points share in the place that all images have in
+        common; ``of_ties``: the part of it that their errors make up."""
+        in_plan = SLOPES_SHARE * self.mean @ of_ties @ self.mean.T
+        return covariance + self.shift @ in_plan @ self.shift.T
+
+    def sigma(self, covariance: Floats) -> Floats:
+        """Standard uncertainty [2] m of the common place, to the east and to the north."""
+        return np.sqrt(np.diag(self.mean @ covariance @ self.mean.T))
+
+
+def with_offsets(
+    parameters: Floats,
+    covariance: Floats,
+    observations: Sequence[tuple[int, PlanObservation]],
+) -> tuple[Floats, Floats]:
+    """Parameters [6 n] and covariance with the ``observations`` of images (index, observation).
+
+    Least squares, the parameters and their covariance being the prior.
+    """
+    if not observations:
+        return parameters, covariance
+    count = 2 * len(observations)
+    design, observed = np.zeros((count, parameters.size)), np.zeros(count)
+    own, common = np.zeros((count, count)), np.zeros((count, 2))
+    for k, (image, seen) in enumerate(observations):
+        rows = slice(2 * k, 2 * k + 2)
+        design[rows, 6 * image : 6 * image + 6] = seen.design
+        observed[rows], own[rows, rows] = seen.observed, seen.covariance
+        common[rows] = COMMON_M * seen.px_per_m
+    errors = own + common @ common.T
+    gain = np.linalg.solve(design @ covariance @ design.T + errors, design @ covariance).T
+    kept = np.eye(parameters.size) - gain @ design
+    moved = parameters + gain @ (observed - design @ parameters)
+    covariance = kept @ covariance @ kept.T + gain @ errors @ gain.T
+    return moved, (covariance + covariance.T) / 2.0
+
+
+log = logging.getLogger("stereotruth")
 
 
 WORTH = 0.5  # of COMMON_M: a place that is known better gains nothing by edges

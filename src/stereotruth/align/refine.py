@@ -18,6 +18,7 @@ other half.
 
 from __future__ import annotations
 
+import csv
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,10 +32,12 @@ from scipy.special import chdtrc
 from ..core.config.labels import Rectify
 from ..core.errors import InputError
 from ..core.numerics.robust import robust_sigma
+from ..core.products.files import atomic_file
 from ..lidar.point_store import PointStore, open_stores
 from ..sensor.image_reader import Source, open_pair
 from .adjustment import (
     LEAST_SIGMA,
+    Equations,
     Estimate,
     Observations,
     agreement_of_halves,
@@ -43,12 +46,12 @@ from .adjustment import (
     pair_equations,
     prior_of,
     pull_of,
+    spread_of,
     with_corrections,
 )
 from .align import PLACES_BY_RPCS
-from .aligned_pair import Alignment, ViewFit
-from .equations import Equations, spread_of
-from .lack_of_fit import SharedErrors, with_shared_errors
+from .alignment import Alignment, ViewFit
+from .lack_of_fit import LabelSigma, SharedErrors, remark_of, with_shared_errors
 from .lidar_checks import (
     HeightOffset,
     chance_of_contradiction,
@@ -63,7 +66,6 @@ from .lidar_checks import (
 )
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
-from .misfit_causes import LabelSigma, remark_of
 from .plan_place import place_pair
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
@@ -485,3 +487,54 @@ def _tell(record: Mapping[str, Any]) -> None:
         if record["applied"]
         else f"not applied: {record['reason']}",
     )
+
+
+COLUMNS = (
+    "site",
+    "left_col_px",
+    "left_row_px",
+    "right_col_px",
+    "right_row_px",
+    "height_m",
+    "epipolar_x_px",
+    "epipolar_y_px",
+    "correlation",
+    "match_sigma_px",
+    "used",
+    "disparity_before_px",
+    "y_parallax_before_px",
+    "disparity_after_px",
+    "y_parallax_after_px",
+    "disparity_by_affines_px",
+    "y_parallax_by_affines_px",
+)
+
+
+def write_refinement(
+    alignment: Alignment,
+    observations: Observations | None,
+    json_file: str | Path,
+    csv_file: str | Path,
+) -> None:
+    """Write a refined alignment (JSON) and its tie points (CSV); without any the table is empty."""
+    with atomic_file(csv_file) as scratch:
+        _write_table(observations, scratch)
+    alignment.save(json_file)
+
+
+def _write_table(observations: Observations | None, path: Path) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        if observations is None:
+            return
+        ties = observations.ties
+        found = ties.right + ties.shift
+        residuals = observations.before, observations.after, observations.by_affines
+        for k in range(len(ties)):
+            row = [f"{v:.3f}" for v in (*ties.left[k], *found[k], ties.height[k])]
+            row += [f"{v:.3f}" for v in observations.at[k]]
+            row += [f"{ties.correlation[k]:.4f}", f"{ties.sigma[k]:.4f}"]
+            row += ["yes" if observations.used[k] else "no"]
+            row += [f"{v:.4f}" for values in residuals for v in values[k]]
+            writer.writerow([ties.site[k], *row])

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from ..core.errors import InputError
+from ..core.products.files import atomic_file, read_record, sealed
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..sensor.line_correction import LineCorrection, of_record, read_correction
 from ..sensor.rpc import RPC, SensorModel
+from .adjustment import read_equations, spread_of
 from .align import LARGE_SHIFT
-from .aligned_pair import Alignment, ViewFit
+from .alignment import Alignment, GcpResidual, ViewFit, over_the_image
 from .control_points import NoPoints, read_gcps
-from .image_doubts import HEAVY, image_doubts
-from .plan_frame import plan_slopes
+from .plan_place import plan_slopes
+from .refine import MIN_USED
 from .site_fit import (
     LEAST_POINTS,
     FixedImages,
@@ -27,11 +31,10 @@ from .site_fit import (
     PairToFit,
     PointsOfImage,
     SiteFit,
+    SiteLines,
     fit_site,
     residual_figures,
 )
-from .site_pair import ScenePair, read_site, rpc_alone
-from .tie_equations import read_equations
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -295,3 +298,226 @@ def _table(points: PointsOfImage, fit: SiteFit, name: str) -> list[dict[str, Any
         }
         for k, (after, one_out, used) in enumerate(rows)
     ]
+
+
+@dataclass(frozen=True)
+class ScenePair:
+    """A scene and the names of its images, its refined alignment, equations and control points."""
+
+    scene: str
+    left: str
+    right: str
+    alignment: Path
+    equations: Path
+    gcps: Path | None = None
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Of both images."""
+        return self.left, self.right
+
+
+def rpc_alone(fit: ViewFit) -> ViewFit:
+    """A fit that corrects nothing, with the parameters of the image alone."""
+    return over_the_image(replace(fit, affine=np.eye(2, 3), gcps=()))
+
+
+def read_site(path: str | Path) -> dict[str, Any]:
+    """What :func:`write_site` wrote. Raises InputError if it is damaged or something else."""
+
+    def checked(values: dict[str, Any]) -> dict[str, Any]:
+        return values | {name: values[name] for name in ("images", "pairs", "covariance")}
+
+    return read_record(path, checked, what="adjusted images", stage="adjust")
+
+
+def write_site(values: Mapping[str, Any], path: str | Path) -> None:
+    """Write what :func:`.site_adjustment.adjust_site` found, as JSON."""
+    with atomic_file(path) as scratch:
+        scratch.write_text(sealed(values), encoding="utf-8")
+
+
+def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
+    """alignment.json of a pair by its images' adjusted corrections, JSON-ready.
+
+    ``site``: what :func:`.site_adjustment.adjust_site` found, or an earlier one that has both
+    images.
+    Of a pair whose image is refused it has the sentence ``refused`` alone, which
+    :meth:`.Alignment.load` raises.
+    """
+    figures = [site["images"][name] for name in scene.names]
+    for name, image in zip(scene.names, figures):
+        if image["refused"]:
+            return {"refused": f"scene {scene.scene}: image {name}: {image['refused']}"}
+    base = Alignment.load(scene.alignment)
+    order = site["covariance"]["images"]
+    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in scene.names])
+    covariance = np.array(site["covariance"]["values"])[np.ix_(index, index)]
+    fits, sensors, warnings = [], [], list(base.warnings)
+    for k, (name, image, fit, sensor) in enumerate(
+        zip(scene.names, figures, base.fits, (base.left, base.right))
+    ):
+        own = slice(6 * k, 6 * k + 6)
+        start = rpc_alone(fit)
+        affine = start.moved(np.array(image["parameters"]))
+        gcps = tuple(
+            GcpResidual(**{k: tuple(v) if isinstance(v, list) else v for k, v in row.items()})
+            for row in image["gcps"]["points"]
+        )
+        fits.append(
+            replace(
+                start,
+                affine=affine,
+                gcps=gcps,
+                sigma0=site["gcp_sigma_px"] if gcps else np.nan,
+                redundancy=2 * sum(g.used for g in gcps),
+                covariance=covariance[own, own],
+            )
+        )
+        sensors.append(SensorModel(sensor.rpc, affine, read_correction(image)))
+        warnings += [f"image {name}: {text}" for text in image["doubts"]]
+    of_pair = site["pairs"].get(scene.scene, {})
+    lines = of_pair.get("lines_covariance")
+    return replace(
+        base,
+        left=sensors[0],
+        right=sensors[1],
+        left_fit=fits[0],
+        right_fit=fits[1],
+        cross_covariance=covariance[:6, 6:],
+        lines_covariance=None if lines is None else np.array(lines),
+        shared_px=of_pair.get("shared_px", 0.0),
+        warnings=tuple(warnings),
+        refinement=_refinement(site, scene) | {"remark": base.refinement.get("remark", "")},
+    ).to_dict()
+
+
+def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
+    """The record of the refinement: the pair's tie points before and after the adjustment."""
+    record = {"applied": True, "reason": ""}
+    ties, reason = read_equations(scene.equations)
+    if ties is None:
+        return record | {"tie_points": 0, "without_own_tie_points": reason}
+    equations = ties.equations
+    used = site["pairs"].get(scene.scene, {}).get("used")  # none of a pair that came later
+    figures = [site["images"][name] for name in scene.names]
+    images = [np.array(of["parameters"]) for of in figures]
+    corrections = {k: one for k, of in enumerate(figures) if (one := read_correction(of))}
+    by_line = SiteLines(corrections, {}).effect(equations.design, equations.lines, (0, 1))
+    size = tuple(site["images"][scene.left]["size"])
+    spreads = {}
+    for word, parameters, lines in (
+        ("before", ties.start, 0.0),
+        ("after", np.concatenate(images), by_line),
+    ):
+        values = equations.observed - equations.design @ parameters - lines
+        spreads[word] = {
+            name: spread_of(values[:, k], equations.at, size)
+            for k, name in enumerate(("disparity", "y_parallax"))
+        }
+    return record | {
+        "tie_points": len(equations.own),
+        "used": used,
+        "sites": int(np.unique(equations.site).size),
+        **spreads,
+        "meaning": "px of the epipolar grid at the tie points: disparity of LiDAR minus that of "
+        "the images, and y-parallax; before: by control points or RPCs, after: by the adjustment "
+        "of all images of the site",
+    }
+
+
+Bools = NDArray[np.bool_]
+Figures = Mapping[str, Mapping[str, Any]]
+
+HEAVY = 0.1  # weight of a pair that is left out, or nearly so
+CHANCE = 0.05  # that a site without a fault has an image that stands out
+FEWEST = 4  # values of a test: if two of three are alike, the third is always an outlier
+MOST_OUT = 0.25  # share of the images that may stand out
+NORMAL = 2.0 / 3.0  # power of a length that is normal if both coordinates are (Wilson, Hilferty)
+LEAST_SPREAD_PX = 0.3  # px to that power, of corrections: less makes none of them stand out
+LEAST_SPREAD_SHARE = 0.1  # of the shares that match, likewise
+
+
+def stand_out(values: Floats, least_spread: float) -> Bools:
+    """Which of n values are too large for the others, by the generalised extreme deviate test.
+
+    Rosner 1983: the largest value is held against mean and standard deviation (``least_spread`` at
+    least), then the largest of the others, and so on; all up to the last one that Student's t makes
+    too unlikely stand out, so that two of them do not hide each other.
+    """
+    order = np.argsort(values)[::-1]
+    count = 0
+    for k in range(max(1, int(MOST_OUT * len(values)))):
+        rest = values[order[k:]]
+        n = len(rest)
+        if n < FEWEST:
+            break
+        t = stdtrit(n - 2, 1.0 - CHANCE / n)
+        limit = (n - 1) * t / np.sqrt((n - 2 + t**2) * n)
+        spread = max(float(rest.std(ddof=1)), least_spread)
+        if rest[0] - rest.mean() > limit * spread:
+            count = k + 1
+    out = np.zeros(len(values), bool)
+    out[order[:count]] = True
+    return out
+
+
+def _named(values: Mapping[str, float], sign: float, least_spread: float) -> set[str]:
+    """The names whose values, times ``sign``, are too large for the others."""
+    out = stand_out(sign * np.array(list(values.values())), least_spread)
+    return {name for name, is_out in zip(values, out) if is_out}
+
+
+def image_doubts(images: Figures, pairs: Figures) -> dict[str, list[str]]:
+    """The doubts of each image by name; ``images``, ``pairs``: figures of the adjustment."""
+    own = {
+        name: [pair for pair in pairs.values() if name in (pair["left"], pair["right"])]
+        for name in images
+    }
+    placed = [name for name, image in images.items() if not image["refused"]]
+    lengths = {
+        name: float(np.hypot(images[name]["correction"]["col"], images[name]["correction"]["row"]))
+        for name in placed
+    }
+    far = _named({name: v**NORMAL for name, v in lengths.items()}, 1.0, LEAST_SPREAD_PX)
+    # A pair matches no better than the poorer of its images: the best pair tells of both.
+    shares = {
+        name: max(pair["matched"] for pair in own[name])
+        for name in placed
+        if any(pair["tie_points"] for pair in own[name])
+    }
+    usual, usual_share = (
+        float(np.median(list(values.values()))) if values else 0.0 for values in (lengths, shares)
+    )
+    poor = _named(shares, -1.0, LEAST_SPREAD_SHARE)
+    poor |= {name for name, share in shares.items() if share < MIN_USED * usual_share}
+    doubts: dict[str, list[str]] = {}
+    for name, image in images.items():
+        texts = doubts.setdefault(name, [])
+        gcps, count = image["gcps"], len(own[name])
+        if image["refused"]:
+            texts.append(image["refused"])
+            continue
+        if name in far and not image["fixed"]:
+            texts.append(
+                f"its RPC is off by {lengths[name]:.1f} px, where {usual:.1f} px are usual here; "
+                "corrected"
+            )
+        if name not in shares:
+            reasons = "; ".join(sorted({pair["reason"] for pair in own[name]}))
+            texts.append(f"no tie points in any of its pairs ({count}): {reasons}")
+        elif name in poor:
+            texts.append(
+                f"of the places compared in its pairs {100 * shares[name]:.0f} % match at best, "
+                f"where {100 * usual_share:.0f} % are usual here: clouds, or another ground?"
+            )
+        light = sum(pair.get("weight", 1.0) < HEAVY for pair in own[name])
+        if light > count / 2:
+            texts.append(
+                f"the tie points of {light} of its {count} pairs contradict the other images"
+            )
+        if gcps["left_out"]:
+            texts.append(
+                f"control points left out, which fit no correction: {', '.join(gcps['left_out'])}"
+            )
+    return doubts

@@ -35,12 +35,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ..align.adjustment import estimate, parameters_of
-from ..align.aligned_pair import Alignment, over_the_image
-from ..align.equations import PairEquations
-from ..align.site_fit import rpc_prior
-from ..align.site_line_corrections import SiteLines
-from ..align.tie_equations import read_equations
+from ..align.adjustment import PairEquations, estimate, parameters_of, read_equations
+from ..align.alignment import Alignment, over_the_image
+from ..align.site_fit import SiteLines, rpc_prior
 from ..core.errors import InputError
 from ..core.numerics.bilinear import between_four
 from ..core.products.files import atomic_file, sealed

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..align.aligned_pair import Alignment
-from ..align.label_uncertainty import LabelUncertainty
-from ..align.strip_uncertainty import with_strips
+from ..align.alignment import Alignment
+from ..align.label_uncertainty import LabelUncertainty, with_strips
 from ..core.config.labels import LabelSettings
 from ..core.dates import acquisition_time
 from ..core.products.grids import require_complete

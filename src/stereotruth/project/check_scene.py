@@ -14,10 +14,10 @@ import rasterio
 from rasterio.errors import RasterioError
 
 from ..align.align import align, from_rpcs
-from ..align.aligned_pair import Alignment
+from ..align.alignment import Alignment
 from ..align.control_points import ControlPoints, TooFewPoints, read_gcps
 from ..align.gcp_checks import open_view
-from ..align.pair_ground import footprint_of
+from ..align.images import footprint_of
 from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.products.ungeoreferenced import open_raster

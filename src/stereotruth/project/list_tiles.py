@@ -11,7 +11,7 @@ from pathlib import Path
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from ..align.pair_ground import footprint_of
+from ..align.images import footprint_of
 from ..core import sheets
 from ..core.config.configuration import Configuration
 from ..core.config.labels import Ingest

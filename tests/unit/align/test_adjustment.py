@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.align.adjustment import estimate
-from stereotruth.align.equations import Equations
+from stereotruth.align.adjustment import Equations, estimate
 
 # ------------------------------------------------------------------------------- the estimate
 

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stereotruth.align.align_figure import draw_residuals
-from stereotruth.align.align_report import write_alignment
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.align import write_alignment
+from stereotruth.align.alignment import Alignment
+from stereotruth.align.figures import draw_residuals
 
 from ...synthetic.surveyed_pair import make_gcps, run
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.align.control_points import COLUMNS, images_measured, read_gcps
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.frames import Epoch

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereocities.rpcs import draw_bias
-from stereotruth.align.image_doubts import CHANCE, NORMAL, image_doubts, stand_out
+from stereotruth.align.site_adjustment import CHANCE, NORMAL, image_doubts, stand_out
 
 
 def image(length: float = 10.0, refused: str = "") -> dict[str, Any]:

@@ -10,10 +10,9 @@ import numpy as np
 import pyproj
 import pytest
 
-from stereotruth.align.adjustment import Estimate, estimate
+from stereotruth.align.adjustment import Equations, Estimate, estimate
 from stereotruth.align.align import align
-from stereotruth.align.aligned_pair import GcpResidual
-from stereotruth.align.equations import Equations
+from stereotruth.align.alignment import GcpResidual
 from stereotruth.align.lidar_checks import (
     LIDAR_SIGMA_M,
     doubt_at_gcps,

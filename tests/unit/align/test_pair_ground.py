@@ -9,7 +9,7 @@ import pyproj
 import pytest
 import rasterio
 
-from stereotruth.align.pair_ground import footprint_of, pair_outlines
+from stereotruth.align.images import footprint_of, pair_outlines
 from stereotruth.align.tie_sites import choose_sites
 from stereotruth.core.products.grids import open_grid
 from stereotruth.epipolar.fit import fit_epipolar

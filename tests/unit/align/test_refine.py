@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.align.aligned_pair import Alignment, GcpResidual
+from stereotruth.align.alignment import Alignment, GcpResidual
+from stereotruth.align.figures import draw_refinement
 from stereotruth.align.label_uncertainty import label_sigma
 from stereotruth.align.lidar_checks import lines_of_sight, scatter_by_heights
-from stereotruth.align.refine import refine
-from stereotruth.align.refine_figure import draw_refinement
-from stereotruth.align.refine_report import write_refinement
+from stereotruth.align.refine import refine, write_refinement
 from stereotruth.core.errors import InputError
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.sensor.rpc import SensorModel

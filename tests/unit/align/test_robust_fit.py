@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.align.robust_fit import System, find_blunders
+from stereotruth.align.gcp_checks import System, find_blunders
 
 
 @pytest.mark.slow

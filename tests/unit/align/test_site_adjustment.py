@@ -10,13 +10,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.align.adjustment import parameters_of
-from stereotruth.align.aligned_pair import Alignment, ViewFit, over_the_image
+from stereotruth.align.adjustment import (
+    Equations,
+    PairEquations,
+    parameters_of,
+    read_equations,
+    write_equations,
+)
+from stereotruth.align.alignment import Alignment, ViewFit, over_the_image
 from stereotruth.align.control_points import LONG
-from stereotruth.align.equations import Equations, PairEquations
-from stereotruth.align.site_adjustment import adjust_site
-from stereotruth.align.site_pair import ScenePair, pair_alignment, read_site, write_site
-from stereotruth.align.tie_equations import read_equations, write_equations
+from stereotruth.align.site_adjustment import (
+    ScenePair,
+    adjust_site,
+    pair_alignment,
+    read_site,
+    write_site,
+)
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import write_table
 

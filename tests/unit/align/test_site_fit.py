@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stereotruth.align.aligned_pair import ViewFit
-from stereotruth.align.equations import Equations, PairEquations
+from stereotruth.align.adjustment import Equations, PairEquations
+from stereotruth.align.alignment import ViewFit
 from stereotruth.align.site_fit import (
     FixedImages,
     ImageToFit,

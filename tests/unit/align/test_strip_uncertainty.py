@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereotruth.align.label_uncertainty import STEP, LabelUncertainty
-from stereotruth.align.strip_uncertainty import SQUARE_DEG, with_strips
+from stereotruth.align.label_uncertainty import SQUARE_DEG, STEP, LabelUncertainty, with_strips
 from stereotruth.core.numerics.degrees import exact_metres_per_degree
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.lidar.point_store import SQUARES

@@ -12,7 +12,7 @@ from stereocities.lidar import simulate_lidar_tile
 from stereocities.site_images import image_truth
 from stereocities.sites import drawn_site
 from stereocities.surfaces import TREE
-from stereotruth.align.aligned_pair import ViewFit
+from stereotruth.align.alignment import ViewFit
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import open_grid
 from stereotruth.labels.image_heights import (

@@ -1,4 +1,4 @@
-"""The corrected RPCs of a pair, with residuals and covariance: alignment.json."""
+"""."""
 
 from __future__ import annotations
 

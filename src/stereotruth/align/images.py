@@ -1,30 +1,61 @@
-"""Ground of a pair whose LiDAR can have a say in its products, before anything is aligned.
-
-By the RPCs alone, with what they may be off and with the heights that they are made for: known
-before LiDAR is read. Labels follow from points that the pair's epipolar grid shows, and from points
-on the rays from there to both cameras; heights of an original image from what its frame shows.
-Whether the LiDAR that was read is enough is asked again with the aligned images
-(``PointWindows.beyond_stores``).
-"""
+"""."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import date, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
+from ..core.dates import acquisition_time
 from ..core.errors import InputError
 from ..core.numerics.hull import corners_of_hull
 from ..core.products.ungeoreferenced import open_raster
 from ..lidar.footprint import Footprint
+from ..sensor.acquisition import Acquisition, by_sheet, read_acquisition
 from ..sensor.pair_geometry import find_overlap, find_rotation
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import read_rpc
+from ..sensor.site_pairs import SiteImage
 from ..sensor.virtual_points import frame, steps
 from .align import RPC_SHIFT, RPC_TILT
+from .gcp_checks import open_view
+
+
+@dataclass(frozen=True)
+class GivenImage:
+    """What the images sheet says: ``acquired`` and ``sun`` (azimuth, elevation) may be None."""
+
+    name: str
+    file: Path
+    acquired: date | datetime | None
+    sun: tuple[float, float] | None
+
+    @classmethod
+    def of(
+        cls, name: str, file: Path, acquired: str, azimuth: float | None, elevation: float | None
+    ) -> GivenImage:
+        """From the cells of a row, which have been checked."""
+        sun = None if azimuth is None or elevation is None else (float(azimuth), float(elevation))
+        return cls(name, file, acquisition_time(acquired) if acquired else None, sun)
+
+
+def open_image(given: GivenImage) -> tuple[SiteImage, Acquisition]:
+    """An image and what its delivery says of it. InputError if it or its RPC cannot be used.
+
+    What the sheet says goes before the delivery.
+    """
+    sensor, size = open_view(f"site's {given.name}", given.file, "")
+    rpc = sensor.rpc
+    place = float(rpc.long_off), float(rpc.lat_off)
+    delivery = read_acquisition(given.file, place)
+    taken = by_sheet(delivery, given.acquired, given.sun, place)
+    return SiteImage(given.name, sensor, size, taken.time, taken.sun), delivery
+
 
 Floats = NDArray[np.float64]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
