@@ -240,7 +240,7 @@ class Made:
 
     def before(self, model: EpipolarModel) -> EpipolarModel:
         """The epipolar model by the ground control points alone; ``model``: the one in use."""
-        aligned = Alignment.load(self.aligned)
+        aligned = Alignment.read(self.aligned)
         sizes = model.left_size, model.right_size
         return fit_epipolar(aligned.left, aligned.right, *sizes, aligned.reference_height)
 

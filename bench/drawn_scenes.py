@@ -420,7 +420,7 @@ def _compared(
             label_by(refined, scene.images, scene.stores, scratch, settings, workers=workers)
             write_grid_truth(scene.city, scene.spec, scratch / "epipolar.json",
                              scratch / "truth.zarr", workers=workers)  # fmt: skip
-    used = Alignment.load(made / "alignment.json")
+    used = Alignment.read(made / "alignment.json")
     labels = compare_scene(
         made / "disparity.zarr", made / "truth.zarr", None, scene=title, workers=workers
     )

@@ -33,7 +33,7 @@ from stereocities.sites import SiteSpec, drawn_site
 from stereotruth.align.adjustment import epipolar_model, write_equations
 from stereotruth.align.align import align, from_rpcs
 from stereotruth.align.alignment import Alignment
-from stereotruth.align.gcp_checks import open_view
+from stereotruth.align.images import open_view
 from stereotruth.align.refine import refine
 from stereotruth.align.site_adjustment import ScenePair, adjust_site, pair_alignment
 from stereotruth.core.config.labels import LabelSettings
@@ -186,7 +186,7 @@ def of_site(number: int, options: argparse.Namespace) -> list[list[str]]:
     rows = []
     for count in (15, 4):
         pairs = [refined(folder, names, count) for names in chosen]
-        alone = {pair.scene: Alignment.load(pair.alignment) for pair in pairs}
+        alone = {pair.scene: Alignment.read(pair.alignment) for pair in pairs}
         adjusted = adjust_site(site.city.name, pairs)
         together = sensors_of(adjusted, pairs)
         noiseless = some_points(folder, count, table="exact")
@@ -273,7 +273,7 @@ def pairs_by_case(number: int, options: argparse.Namespace) -> dict[str, list[Pa
         together = pair_alignment(adjusted, pair)
         if "refused" in together:
             continue
-        alignments = Alignment.from_dict(together), Alignment.load(pair.alignment)
+        alignments = Alignment.from_dict(together), Alignment.read(pair.alignment)
         for case, alignment in zip(CASES, alignments):
             found[case].append(labelled(folder, pair, alignment, surface, case))
     return found

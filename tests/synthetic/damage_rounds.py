@@ -36,7 +36,7 @@ import numpy as np
 
 from stereotruth.align.align import align, write_alignment
 from stereotruth.align.figures import draw_residuals
-from stereotruth.align.gcp_checks import open_view
+from stereotruth.align.images import open_view
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import in_own_process
 from stereotruth.lidar.ingest import ingest

@@ -111,7 +111,7 @@ def _tiles(place: Path) -> Any:
 
 def _alignment(place: Path) -> Any:
     """An alignment that is not as it was written is used, and told in the log."""
-    alignment = Alignment.load(place)
+    alignment = Alignment.read(place)
     if not read_perhaps_edited(place)[1]:
         raise InputError("edited since it was made", file=place, remedy="run again")
     return repr(alignment.to_dict())

@@ -12,7 +12,7 @@ if __name__ == "__main__":
         making(snakemake.input, snakemake.output),
     ):
         draw_refinement(
-            Alignment.load(given.alignment),
+            Alignment.read(given.alignment),
             given.observations,
             snakemake.output.figure,
             given.left[0],

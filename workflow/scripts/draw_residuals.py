@@ -10,4 +10,4 @@ if __name__ == "__main__":
         job(snakemake.log[0], f"draw residuals {snakemake.wildcards.scene}"),
         making(snakemake.input, snakemake.output),
     ):
-        draw_residuals(Alignment.load(snakemake.input.alignment), snakemake.output.figure)
+        draw_residuals(Alignment.read(snakemake.input.alignment), snakemake.output.figure)

@@ -12,7 +12,7 @@ if __name__ == "__main__":
         job(snakemake.log[0], f"heights {image}"),
         making(snakemake.input, snakemake.output),
     ):
-        alignment = Alignment.load(snakemake.input.alignment)
+        alignment = Alignment.read(snakemake.input.alignment)
         fit = getattr(alignment, f"{view}_fit")
         inputs = open_inputs(
             getattr(alignment, view),

@@ -17,7 +17,7 @@ if __name__ == "__main__":
         job(snakemake.log[0], f"rectify {scene} {strip}"),
         making(snakemake.input, snakemake.output),
     ):
-        alignment = Alignment.load(snakemake.input.alignment)
+        alignment = Alignment.read(snakemake.input.alignment)
         bands = Rectify(**snakemake.params.bands)
         with open_pair(*names, *masks, bands=bands) as (left, right):
             model = fit_epipolar(

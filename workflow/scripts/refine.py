@@ -22,7 +22,7 @@ if __name__ == "__main__":
         for store in map(PointStore, given.points):
             inputs[f"points/{store.path.name}"] = digest(store.attrs.get("provenance", {}))
         alignment, observations = refine(
-            Alignment.load(given.alignment),
+            Alignment.read(given.alignment),
             given.left[0],
             given.right[0],
             given.points,

@@ -14,10 +14,7 @@ from ..core.numerics.robust import TUKEY, median_and_nmad, robust_sigma, tukey_w
 from ..core.products.files import atomic_file, read_record, sealed
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
-from ..sensor.line_correction import LineCorrection
-from ..sensor.rpc import SensorModel
-from .align import RPC_TILT
-from .alignment import Alignment, ViewFit, over_the_image
+from .alignment import Alignment, over_the_image, parameters_of
 from .tie_points import Geometry, TiePoints
 
 Bools = NDArray[np.bool_]
@@ -32,6 +29,102 @@ FREE = 1e-4  # share of the prior's weight that keeps a fit without it determine
 STARTS = 300  # planes, and shifts, from which the adjustment starts
 START_PX = 0.03  # px of an observation, besides its own, when blunders are looked for
 BLUNDER_ODDS = 1.0  # px²: of no blunder to a blunder in a square pixel
+MEANING = (
+    "observed [along, across the epipolar rows; px] = design [2, 12] @ parameters + error, one row "
+    "per tie point; parameters: (a_u, a_v, a_1, b_u, b_v, b_1) of the left image, then of the "
+    "right, of the correction of the RPC's (col, row) by (a_u u + a_v v + a_1, b_u u + b_v v + "
+    "b_1), px, (u, v) being px from the image's middle in halves of its longer side; own: px, "
+    "standard deviation of the match by itself; site: tie points of one part of the scene; at: "
+    "(col, row) px in the left image, there: in the right one; in_plan: of the left and the right "
+    "image, by edges of roofs: observed [col, row; px] = design [2, 6] @ parameters of the image + "
+    "error of this covariance [px^2], and px_per_m @ (east, north; m) of an error that all share"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Observations [n] of what the corrections change: observed = design · parameters + errors.
+
+    ``design`` [n, 2, 12], ``observed`` [n, 2] px, along and across the rows. ``own`` [n] px: the
+    matches' own standard deviations, which count as ratios only (poor matches are poorer than that,
+    and biased where the surface is not what the points say). Observations of one ``site`` int[n]
+    share errors. ``at``, ``there`` [n, 2] px: place in the left and in the right image.
+    """
+
+    design: Floats
+    observed: Floats
+    own: Floats
+    site: NDArray[np.int64]
+    at: Floats
+    there: Floats
+
+    @property
+    def lines(self) -> Floats:
+        """[n, 2] px: lines of the left and of the right image."""
+        return np.column_stack([self.at[:, 1], self.there[:, 1]])
+
+    def part(self, chosen: Bools) -> Equations:
+        """Those that are ``chosen`` [n]."""
+        return Equations(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
+    def about(self, parameters: Floats) -> Equations:
+        """The same of parameters that are counted from given ones [12]."""
+        return replace(self, observed=self.observed - self.design @ parameters)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanObservation:
+    """The place of an image in plan, in px of (col, row): observed = design @ parameters + error.
+
+    ``design`` [2, 6] of the parameters of :func:`.adjustment.parameters_of`, ``observed`` [2],
+    ``covariance`` [2, 2] px² of the image's own error; ``px_per_m`` [2, 2]: by what a metre to the
+    east and to the north moves a place, and so the error that all images have in common.
+    """
+
+    design: Floats
+    observed: Floats
+    covariance: Floats
+    px_per_m: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class PairEquations:
+    """What the tie points of a pair say of its images, whatever alignment they were found with.
+
+    ``equations``: of the parameters [12] of :func:`.adjustment.parameters_of` of both images, left
+    first.
+    ``start`` [12]: those of the alignment by control points or RPCs; ``linearised_at`` [12]: those
+    with which the tie points were matched. ``places``: where the images were compared, with and
+    without a match. ``common_px``: see :func:`.adjustment.estimate`. ``in_plan``: the
+    place of the left and of the right image in plan, if edges of roofs tell it.
+    """
+
+    equations: Equations
+    start: Floats
+    linearised_at: Floats
+    places: int
+    common_px: float
+    in_plan: tuple[PlanObservation, ...] = ()
+
+
+def spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:
+    """Figures of one component [n] in px; the trend is that of a plane over the left image.
+
+    ``at`` [n, 2] px in the left image of ``size`` (cols, rows).
+    """
+    median, nmad = median_and_nmad(values)
+    middle, half = np.array(size) / 2, max(size) / 2
+    design = np.column_stack([(at - middle) / half, np.ones(len(values))])
+    plane = np.linalg.lstsq(design, values, rcond=None)[0]
+    figures = {
+        "median": median,
+        "nmad": nmad,
+        "rms": float(np.sqrt(np.mean(values**2))),
+        "trend_rms": float(np.sqrt(np.mean((design @ plane) ** 2))),
+        "trend_over_half_the_image_col": float(plane[0]),
+        "trend_over_half_the_image_row": float(plane[1]),
+    }
+    return {name: round(value, 4) for name, value in figures.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,22 +187,6 @@ class Estimate:
         information = float(along @ both @ along)
         observed = np.linalg.pinv(self.root) @ self.alone
         return float(along @ both @ observed) / information, information**-0.5
-
-
-def prior_of(alignment: Alignment) -> Floats:
-    """Covariance [12, 12] of both fits; what a simpler model keeps fixed may be off as RPCs are."""
-    prior = alignment.covariance.copy()
-    if alignment.model == "affine":
-        return prior
-    free = np.zeros((6, 6))
-    free[[0, 1, 3, 4], [0, 1, 3, 4]] = 1.0
-    if alignment.model == "similarity":
-        for turn in ([1, 0, 0, 0, 1, 0], [0, -1, 0, 1, 0, 0]):
-            free -= np.outer(turn, turn) / 2.0
-    for k, fit in enumerate(alignment.fits):
-        own = slice(6 * k, 6 * k + 6)
-        prior[own, own] += free * (RPC_TILT * fit.scale) ** 2
-    return prior
 
 
 def root_of(covariance: Floats) -> Floats:
@@ -318,13 +395,6 @@ def linearised_at(
     return np.concatenate([-slopes @ ties.carry @ left, slopes @ right], axis=-1), slopes
 
 
-def parameters_of(fit: ViewFit) -> Floats:
-    """[6] of a fit's affine against none, in the order of ``covariance`` and its coordinates."""
-    change = fit.affine - np.eye(2, 3)
-    at_origin = change[:, 2] + change[:, :2] @ np.array(fit.origin)
-    return np.column_stack([change[:, :2] * fit.scale, at_origin]).ravel()
-
-
 def pair_equations(
     start: Alignment,
     current: Alignment,
@@ -351,36 +421,6 @@ def pair_equations(
     return PairEquations(equations, parameters(start), at, places, common_px)
 
 
-def with_corrections(
-    alignment: Alignment,
-    parameters: Floats,
-    by_line: tuple[LineCorrection | None, LineCorrection | None] = (None, None),
-) -> Alignment:
-    """The alignment with both affines moved by parameters [12], and corrections by line."""
-    fits, sensors = [], []
-    for fit, sensor, own, lines in zip(
-        alignment.fits,
-        (alignment.left, alignment.right),
-        (parameters[:6], parameters[6:]),
-        by_line,
-    ):
-        affine = fit.moved(own)
-        sensors.append(SensorModel(sensor.rpc, affine, lines))
-        gcps = []
-        for gcp in fit.gcps:
-            at = affine @ (*gcp.predicted, 1.0)
-            after = np.array(gcp.measured) - (at if lines is None else np.array(lines.add(*at)))
-            gcps.append(replace(gcp, after=tuple(after.tolist())))
-        fits.append(replace(fit, affine=affine, gcps=tuple(gcps)))
-    return replace(
-        alignment,
-        left=sensors[0],
-        right=sensors[1],
-        left_fit=fits[0],
-        right_fit=fits[1],
-    )
-
-
 def epipolar_model(alignment: Alignment) -> EpipolarModel:
     """The epipolar model of the corrected RPCs."""
     return fit_epipolar(
@@ -399,104 +439,6 @@ def pull_of(design: Floats, observed: Floats, prior: Floats) -> Floats:
     inner = (design @ root).reshape(-1, root.shape[1])
     normal = np.eye(root.shape[1]) + inner.T @ inner / len(design)
     return root @ np.linalg.solve(normal, inner.T @ observed.ravel() / len(design))
-
-
-@dataclass(frozen=True, eq=False)
-class Equations:
-    """Observations [n] of what the corrections change: observed = design · parameters + errors.
-
-    ``design`` [n, 2, 12], ``observed`` [n, 2] px, along and across the rows. ``own`` [n] px: the
-    matches' own standard deviations, which count as ratios only (poor matches are poorer than that,
-    and biased where the surface is not what the points say). Observations of one ``site`` int[n]
-    share errors. ``at``, ``there`` [n, 2] px: place in the left and in the right image.
-    """
-
-    design: Floats
-    observed: Floats
-    own: Floats
-    site: NDArray[np.int64]
-    at: Floats
-    there: Floats
-
-    @property
-    def lines(self) -> Floats:
-        """[n, 2] px: lines of the left and of the right image."""
-        return np.column_stack([self.at[:, 1], self.there[:, 1]])
-
-    def part(self, chosen: Bools) -> Equations:
-        """Those that are ``chosen`` [n]."""
-        return Equations(*(getattr(self, f.name)[chosen] for f in fields(self)))
-
-    def about(self, parameters: Floats) -> Equations:
-        """The same of parameters that are counted from given ones [12]."""
-        return replace(self, observed=self.observed - self.design @ parameters)
-
-
-@dataclass(frozen=True, eq=False)
-class PlanObservation:
-    """The place of an image in plan, in px of (col, row): observed = design @ parameters + error.
-
-    ``design`` [2, 6] of the parameters of :func:`.adjustment.parameters_of`, ``observed`` [2],
-    ``covariance`` [2, 2] px² of the image's own error; ``px_per_m`` [2, 2]: by what a metre to the
-    east and to the north moves a place, and so the error that all images have in common.
-    """
-
-    design: Floats
-    observed: Floats
-    covariance: Floats
-    px_per_m: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class PairEquations:
-    """What the tie points of a pair say of its images, whatever alignment they were found with.
-
-    ``equations``: of the parameters [12] of :func:`.adjustment.parameters_of` of both images, left
-    first.
-    ``start`` [12]: those of the alignment by control points or RPCs; ``linearised_at`` [12]: those
-    with which the tie points were matched. ``places``: where the images were compared, with and
-    without a match. ``common_px``: see :func:`.adjustment.estimate`. ``in_plan``: the
-    place of the left and of the right image in plan, if edges of roofs tell it.
-    """
-
-    equations: Equations
-    start: Floats
-    linearised_at: Floats
-    places: int
-    common_px: float
-    in_plan: tuple[PlanObservation, ...] = ()
-
-
-def spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:
-    """Figures of one component [n] in px; the trend is that of a plane over the left image.
-
-    ``at`` [n, 2] px in the left image of ``size`` (cols, rows).
-    """
-    median, nmad = median_and_nmad(values)
-    middle, half = np.array(size) / 2, max(size) / 2
-    design = np.column_stack([(at - middle) / half, np.ones(len(values))])
-    plane = np.linalg.lstsq(design, values, rcond=None)[0]
-    figures = {
-        "median": median,
-        "nmad": nmad,
-        "rms": float(np.sqrt(np.mean(values**2))),
-        "trend_rms": float(np.sqrt(np.mean((design @ plane) ** 2))),
-        "trend_over_half_the_image_col": float(plane[0]),
-        "trend_over_half_the_image_row": float(plane[1]),
-    }
-    return {name: round(value, 4) for name, value in figures.items()}
-
-
-MEANING = (
-    "observed [along, across the epipolar rows; px] = design [2, 12] @ parameters + error, one row "
-    "per tie point; parameters: (a_u, a_v, a_1, b_u, b_v, b_1) of the left image, then of the "
-    "right, of the correction of the RPC's (col, row) by (a_u u + a_v v + a_1, b_u u + b_v v + "
-    "b_1), px, (u, v) being px from the image's middle in halves of its longer side; own: px, "
-    "standard deviation of the match by itself; site: tie points of one part of the scene; at: "
-    "(col, row) px in the left image, there: in the right one; in_plan: of the left and the right "
-    "image, by edges of roofs: observed [col, row; px] = design [2, 6] @ parameters of the image + "
-    "error of this covariance [px^2], and px_per_m @ (east, north; m) of an error that all share"
-)
 
 
 def write_equations(path: str | Path, ties: PairEquations | None, reason: str) -> None:

@@ -1,4 +1,11 @@
-"""."""
+"""Images of a pair or a site, opened, and the ground of a pair by their RPCs alone.
+
+The ground of a pair is that whose LiDAR can have a say in its products. It is known before LiDAR is
+read and before anything is aligned: by the RPCs, with what they may be off and with the heights
+that they are made for. Labels follow from points that the pair's epipolar grid shows, and from
+points on the rays from there to both cameras; heights of an original image from what its frame
+shows. Whether the LiDAR that was read is enough is asked again with the aligned images.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +13,133 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
+from pyproj.exceptions import ProjError
 from rasterio.errors import RasterioError
 
 from ..core.dates import acquisition_time
 from ..core.errors import InputError
+from ..core.numerics.degrees import metres_per_degree, turn
 from ..core.numerics.hull import corners_of_hull
 from ..core.products.ungeoreferenced import open_raster
 from ..lidar.footprint import Footprint
 from ..sensor.acquisition import Acquisition, by_sheet, read_acquisition
 from ..sensor.pair_geometry import find_overlap, find_rotation
 from ..sensor.rpc import SensorModel
-from ..sensor.rpc_files import read_rpc
+from ..sensor.rpc_files import read_rpc, rpc_file
 from ..sensor.site_pairs import SiteImage
 from ..sensor.virtual_points import frame, steps
-from .align import RPC_SHIFT, RPC_TILT
-from .gcp_checks import open_view
+from .alignment import RPC_SHIFT, RPC_TILT
+
+Floats = NDArray[np.float64]
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+
+DEVIATIONS = 4.0  # of what RPCs are off
+HEIGHT_SHARE = 0.25  # of the RPCs' range of heights, that the ground may lie outside of it
+EDGE = 33  # places along each side of a frame
+LEVELS = 7  # heights
+FARTHEST_LON = 179.0  # degrees: beyond, footprints are not told apart
+MOST_DEGREES = 10.0  # along a side of a footprint: more is none of one site
+PIXEL_M = (0.01, 1000.0)  # m on the ground
+PIXEL_RATIO = 2.0  # of the largest and smallest in an image, over the heights of its RPC
+GRID_SHIFT_M = 100.0  # between an image's map grid and its RPC: rounded corners and a loose RPC
+GRID_BENT = 0.01  # of the image's diagonal likewise, without the shift
+
+
+def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, int]]:
+    """The RPC of an image and its size (cols, rows).
+
+    Raises InputError: unreadable, or an RPC that does not see the ground by the image's pixels.
+    """
+    sensor = SensorModel(read_rpc(image))
+    try:
+        with open_raster(image) as dataset:
+            size = dataset.width, dataset.height
+            apart = _apart_of_grid(dataset, sensor)
+    except RasterioError as error:
+        raise InputError(
+            f"cannot be opened as the {name} image{of} ({error})",
+            file=image,
+            remedy="check the file",
+        ) from None
+    if apart:
+        raise InputError(
+            f"the {name} image {image.name} is on a map grid and has an RPC, which put its pixels "
+            f"{apart:.0f} m apart: it was map-projected, or cut, and kept the RPC from before{of}",
+            file=image,
+            remedy="give the image as the sensor saw it, with its RPC; if it is that, take the "
+            "grid away (gdal_edit.py -unsetgt -a_srs '')",
+        )
+    if defect := _blindness(sensor, size):
+        raise InputError(
+            f"the RPC of the {name} image {image.name} cannot be right: {defect}{of}",
+            file=rpc_file(image),
+            remedy="check that RPC and image belong together, and get the RPC again from the "
+            "image's supplier",
+        )
+    return sensor, size
+
+
+def _apart_of_grid(dataset: Any, sensor: SensorModel) -> float:
+    """Metres by which an image's map grid and its RPC contradict each other; 0 if they do not.
+
+    Images that were projected to a plane (ortho-ready) have RPCs of their own, which agree with the
+    grid at one height. Corners of NITF are rounded to a second of arc: GRID_SHIFT_M is allowed.
+    """
+    if dataset.crs is None or dataset.transform == dataset.transform.identity():
+        return 0.0
+    try:
+        to_degrees = pyproj.Transformer.from_crs(dataset.crs.to_wkt(), 4326, always_xy=True)
+    except ProjError:
+        return 0.0
+    axes = (np.linspace(0, n - 1, 5) for n in (dataset.width, dataset.height))
+    col, row = (v.ravel() for v in np.meshgrid(*axes))
+    lon, lat = to_degrees.transform(*(dataset.transform * (col + 0.5, row + 0.5)))
+    best = np.inf, np.inf
+    for share in np.linspace(-1.0, 1.0, 21):
+        height = sensor.rpc.height_off + share * sensor.rpc.height_scale
+        at = np.array(sensor.localize(col, row, height)) - (lon, lat)
+        east, north = np.stack([turn(at[0]), at[1]]) * metres_per_degree(lat)
+        whole = np.hypot(east, north)
+        bent = np.hypot(east - east.mean(), north - north.mean())
+        if np.isfinite(whole).all():
+            best = min(best, (float(np.sqrt(np.mean(whole**2))), float(np.sqrt(np.mean(bent**2)))))
+    east, north = (np.ptp(v) for v in np.array([lon, lat]) * metres_per_degree(lat))
+    is_other = best[0] > GRID_SHIFT_M or best[1] > GRID_BENT * np.hypot(east, north)
+    return best[0] if is_other and np.isfinite(best[0]) else 0.0
+
+
+def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
+    """Why an RPC cannot be that of an image of this size, or an empty string."""
+    rpc = sensor.rpc
+    cols, rows = (np.linspace(0, n - 1, 3) for n in size)
+    heights = rpc.height_off + rpc.height_scale * np.array([0.0, -1.0, 1.0])
+    height, row, col = (a.reshape(3, 9) for a in np.meshgrid(heights, rows, cols, indexing="ij"))
+    lon, lat = sensor.localize(col, row, height)
+    if not np.isfinite([lon[0], lat[0]]).all():
+        return "lines of sight through its middle and corners do not meet the ground"
+    sides = []
+    for step in ((1.0, 0.0), (0.0, 1.0)):
+        there = np.array(sensor.localize(col + step[0], row + step[1], height)) - (lon, lat)
+        side = np.hypot(*(there * metres_per_degree(lat)))
+        sides.append(side[np.isfinite(side)])
+        if not (PIXEL_M[0] <= sides[-1].min() and sides[-1].max() <= PIXEL_M[1]):
+            return f"its pixels would be {sides[-1].min():.3g} to {sides[-1].max():.3g} m long"
+        if sides[-1].max() > PIXEL_RATIO * sides[-1].min():
+            return (
+                f"its pixels would be {sides[-1].min():.3g} m long here and "
+                f"{sides[-1].max():.3g} m there"
+            )
+    west, south, east, north, low, high = rpc.ground_box
+    axes = (np.linspace(*ends, 5) for ends in ((west, east), (south, north), (low, high)))
+    terms = rpc.denominators(*(axis.reshape(-1) for axis in np.meshgrid(*axes)))
+    if (terms.min(axis=1) * terms.max(axis=1) <= 0).any():
+        return "a denominator vanishes within its own ground box"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -55,17 +171,6 @@ def open_image(given: GivenImage) -> tuple[SiteImage, Acquisition]:
     delivery = read_acquisition(given.file, place)
     taken = by_sheet(delivery, given.acquired, given.sun, place)
     return SiteImage(given.name, sensor, size, taken.time, taken.sun), delivery
-
-
-Floats = NDArray[np.float64]
-Sizes = tuple[tuple[int, int], tuple[int, int]]
-
-DEVIATIONS = 4.0  # of what RPCs are off
-HEIGHT_SHARE = 0.25  # of the RPCs' range of heights, that the ground may lie outside of it
-EDGE = 33  # places along each side of a frame
-LEVELS = 7  # heights
-FARTHEST_LON = 179.0  # degrees: beyond, footprints are not told apart
-MOST_DEGREES = 10.0  # along a side of a footprint: more is none of one site
 
 
 def footprint_of(

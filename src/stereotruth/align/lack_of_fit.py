@@ -10,6 +10,7 @@ sure the corrections are.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +20,6 @@ from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
 from .adjustment import MATCHING, Equations, Estimate
-from .line_fit import LineFit, amount, climb
 
 Floats = NDArray[np.float64]
 
@@ -30,6 +30,38 @@ UNKNOWNS = 2  # a standard deviation and a length
 LENGTHS = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)  # of the covariance, in spacings of the sites
 FEWEST = 12  # sites that tell a covariance
 LEAST = 0.5  # of the variance that labels have at least, whatever the corrections take of it
+# Standard deviations are found on a grid of ratios: the same on any machine.
+STEP = 2.0**0.5
+WIDEST = 12  # steps to either side of one; none at the lowest
+Steps = tuple[int, ...]
+
+
+def amount(step: int) -> float:
+    """A standard deviation by its step, in a unit of the caller's."""
+    return 0.0 if step <= -WIDEST else STEP**step
+
+
+def climb(score: Callable[[Steps], float], start: Steps) -> tuple[Steps, float]:
+    """Steps from ``start`` on to where no neighbour along an axis scores higher, and the score."""
+    scores: dict[Steps, float] = {}
+
+    def known(steps: Steps) -> float:
+        if steps not in scores:
+            scores[steps] = score(steps)
+        return scores[steps]
+
+    best, top = start, known(start)
+    moved = True
+    while moved:
+        moved = False
+        for axis in range(len(start)):
+            for step in (-1, 1):
+                while abs(best[axis] + step) <= WIDEST:
+                    there = (*best[:axis], best[axis] + step, *best[axis + 1 :])
+                    if not (value := known(there)) > top + 1e-9:
+                        break
+                    best, top, moved = there, value, True
+    return best, top
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +79,11 @@ class SharedErrors:
     chance: tuple[float, float]
     label_px: float = 0.0
     smooth: bool = False
+
+    @property
+    def are_told(self) -> bool:
+        """Whether sites share more of the disparity than chance explains."""
+        return self.sigma_px[0] > 0.0 and self.chance[0] < CHANCE
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -224,64 +261,3 @@ def _counted(
         contradiction_freedom=int(seen.sum()),
     )
     return counted, replace(shared, label_px=label)
-
-
-TOLD = 2.0  # times that σ grows, from which on it is said
-
-
-@dataclass(frozen=True)
-class LabelSigma:
-    """Standard deviation px of disparity on level ground, median of the tie points: by the scatter
-    of the tie points alone, and as labels state it."""
-
-    by_scatter: float
-    stated: float
-
-    @classmethod
-    def of(
-        cls,
-        design: Floats,
-        lines: Floats,
-        rows: int,
-        covariances: tuple[Floats, Floats],
-        fit: LineFit,
-        shared: SharedErrors,
-    ) -> LabelSigma:
-        """At tie points: ``design`` [n, 12] along the rows, ``lines`` [n] of the left image, which
-        has ``rows``; ``covariances`` [12, 12] of the parameters by scatter alone and as stated."""
-        alone, all_ = (np.einsum("np,pq,nq->n", design, c, design) for c in covariances)
-        all_ = all_ + shared.label_px**2
-        if (nodes := fit.used_covariance) is not None:
-            at = np.clip(np.rint(lines / (rows - 1.0) * (len(nodes) - 1)), 0, len(nodes) - 1)
-            shifts = design[:, [2, 5, 8, 11]]
-            all_ = all_ + np.einsum("np,npq,nq->n", shifts, nodes[at.astype(int)], shifts)
-        return cls(*(float(np.sqrt(np.median(values))) for values in (alone, all_)))
-
-
-def remark_of(sigma: LabelSigma, fit: LineFit, shared: SharedErrors) -> str:
-    """A sentence where lines are corrected, or σ grows by more than TOLD; else nothing."""
-    grown = sigma.stated > TOLD * sigma.by_scatter
-    causes = []
-    if fit.stands_out:
-        along, across = fit.rms_px
-        causes.append(
-            f"the attitude jitters (residuals of tie points depend on the image line, by "
-            f"{along:.2f} px along and {across:.2f} px across the lines), which is corrected by "
-            "line"
-        )
-    if shared.sigma_px[0] and shared.chance[0] < CHANCE and grown:
-        amount = f"{shared.sigma_px[0]:.3f} px of disparity"
-        causes.append(
-            f"residuals change smoothly over the scene and not by line ({amount}), as RPCs leave "
-            "that no affine corrects"
-            if shared.smooth
-            else f"tie points near each other share errors, not by line ({amount}), as strips of "
-            "the LiDAR that disagree leave"
-        )
-    if not causes:
-        return ""
-    stated = (
-        f"the alignment's part of labels' uncertainty is {sigma.stated:.3f} px instead of "
-        f"{sigma.by_scatter:.3f} px"
-    )
-    return "; ".join([*causes, stated] if grown else causes)

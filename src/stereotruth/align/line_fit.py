@@ -14,7 +14,6 @@ half of the sites fit the tie points of the other half better than none.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,40 +34,7 @@ from .adjustment import (
     estimate,
     root_of,
 )
-
-Steps = tuple[int, ...]
-
-STEP = 2.0**0.5
-WIDEST = 12  # steps to either side of one; none at the lowest
-
-
-def amount(step: int) -> float:
-    """A standard deviation by its step, in a unit of the caller's."""
-    return 0.0 if step <= -WIDEST else STEP**step
-
-
-def climb(score: Callable[[Steps], float], start: Steps) -> tuple[Steps, float]:
-    """Steps from ``start`` on to where no neighbour along an axis scores higher, and the score."""
-    scores: dict[Steps, float] = {}
-
-    def known(steps: Steps) -> float:
-        if steps not in scores:
-            scores[steps] = score(steps)
-        return scores[steps]
-
-    best, top = start, known(start)
-    moved = True
-    while moved:
-        moved = False
-        for axis in range(len(start)):
-            for step in (-1, 1):
-                while abs(best[axis] + step) <= WIDEST:
-                    there = (*best[:axis], best[axis] + step, *best[axis + 1 :])
-                    if not (value := known(there)) > top + 1e-9:
-                        break
-                    best, top, moved = there, value, True
-    return best, top
-
+from .lack_of_fit import WIDEST, Steps, amount, climb
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

@@ -18,7 +18,6 @@ other half.
 
 from __future__ import annotations
 
-import csv
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from scipy.special import chdtrc
 from ..core.config.labels import Rectify
 from ..core.errors import InputError
 from ..core.numerics.robust import robust_sigma
-from ..core.products.files import atomic_file
+from ..core.products.files import write_table
 from ..lidar.point_store import PointStore, open_stores
 from ..sensor.image_reader import Source, open_pair
 from ..surface.surface_store import SurfaceStore
@@ -45,16 +44,15 @@ from .adjustment import (
     epipolar_model,
     linearised_at,
     pair_equations,
-    prior_of,
     pull_of,
     spread_of,
-    with_corrections,
 )
 from .align import PLACES_BY_RPCS
-from .alignment import Alignment, ViewFit
-from .lack_of_fit import LabelSigma, SharedErrors, remark_of, with_shared_errors
-from .lidar_checks import (
+from .alignment import Alignment, ViewFit, prior_of, with_corrections
+from .doubts import (
+    MIN_USED,
     HeightOffset,
+    LabelSigma,
     chance_of_contradiction,
     control_points_of,
     doubt_at_gcps,
@@ -63,8 +61,10 @@ from .lidar_checks import (
     height_by_rpcs,
     heights_of_model,
     pixel_m,
+    remark_of,
     scatter_by_heights,
 )
+from .lack_of_fit import SharedErrors, with_shared_errors
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
 from .plan_place import place_pair
@@ -84,7 +84,6 @@ SETTLED = 0.01  # px, change of a round after which no other follows
 MOVED = 3.0  # px in the left image after which places are looked for anew
 MIN_PLACES, MIN_SITES = 30, 8
 LOOSE = 0.5  # px: tie points that scatter more, or half of them blunders, tell nothing
-MIN_USED = 0.5
 DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, that is worth a word
 SIGNIFICANT = 0.001  # probability of the change by chance, if the alignment were right
 
@@ -492,27 +491,6 @@ def _tell(record: Mapping[str, Any]) -> None:
     )
 
 
-COLUMNS = (
-    "site",
-    "left_col_px",
-    "left_row_px",
-    "right_col_px",
-    "right_row_px",
-    "height_m",
-    "epipolar_x_px",
-    "epipolar_y_px",
-    "correlation",
-    "match_sigma_px",
-    "used",
-    "disparity_before_px",
-    "y_parallax_before_px",
-    "disparity_after_px",
-    "y_parallax_after_px",
-    "disparity_by_affines_px",
-    "y_parallax_by_affines_px",
-)
-
-
 def write_refinement(
     alignment: Alignment,
     observations: Observations | None,
@@ -520,24 +498,20 @@ def write_refinement(
     csv_file: str | Path,
 ) -> None:
     """Write a refined alignment (JSON) and its tie points (CSV); without any the table is empty."""
-    with atomic_file(csv_file) as scratch:
-        _write_table(observations, scratch)
-    alignment.save(json_file)
-
-
-def _write_table(observations: Observations | None, path: Path) -> None:
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        if observations is None:
-            return
-        ties = observations.ties
-        found = ties.right + ties.shift
-        residuals = observations.before, observations.after, observations.by_affines
+    places = [f"{view}_{axis}_px" for view in ("left", "right") for axis in ("col", "row")]
+    places += ["height_m", "epipolar_x_px", "epipolar_y_px"]
+    states = ("before", "after", "by_affines")
+    residuals = [f"{name}_{state}_px" for state in states for name in ("disparity", "y_parallax")]
+    columns = ["site", *places, "correlation", "match_sigma_px", "used", *residuals]
+    rows = []
+    if observations is not None:
+        o, ties = observations, observations.ties
+        at = np.column_stack([ties.left, ties.right + ties.shift, ties.height, o.at])
+        quality = np.column_stack([ties.correlation, ties.sigma])
+        left = np.column_stack([getattr(o, state) for state in states])
         for k in range(len(ties)):
-            row = [f"{v:.3f}" for v in (*ties.left[k], *found[k], ties.height[k])]
-            row += [f"{v:.3f}" for v in observations.at[k]]
-            row += [f"{ties.correlation[k]:.4f}", f"{ties.sigma[k]:.4f}"]
-            row += ["yes" if observations.used[k] else "no"]
-            row += [f"{v:.4f}" for values in residuals for v in values[k]]
-            writer.writerow([ties.site[k], *row])
+            row = [str(ties.site[k]), *(f"{v:.3f}" for v in at[k])]
+            row += [*(f"{v:.4f}" for v in quality[k]), "yes" if o.used[k] else "no"]
+            rows.append(dict(zip(columns, [*row, *(f"{v:.4f}" for v in left[k])])))
+    write_table(csv_file, rows, columns)
+    alignment.save(json_file)

@@ -1,14 +1,18 @@
 """One correction per image: the images of a site that share ground, adjusted together.
 
 Unknown are the affine corrections of all images. Three kinds of observations bear on them: the
-RPCs, which are off by RPC_SHIFT and RPC_TILT; control points as measured in each image; and the tie
-points of each pair (:mod:`.refine`), which bind the errors of two images to each other and, on
-slopes, to the LiDAR. A pair enters as its normal equations, whose weights are those of its own
+RPCs, which are off by :func:`.alignment.rpc_prior`; control points as measured in each image; and
+the tie points of each pair (:mod:`.refine`), which bind the errors of two images to each other and,
+on slopes, to the LiDAR. A pair enters as its normal equations, whose weights are those of its own
 robust estimate. Images that share no pair are bound through those between them.
 
 Control points that no correction fits get no weight (Tukey's biweight), and so do pairs whose tie
 points contradict those of the other pairs by more than their errors explain. The result does not
 depend on the order of images or pairs.
+
+Each pair tells by itself whether its lines are off (:mod:`.line_fit`). The images of pairs that do
+get one correction by line each, as Gaussian processes whose standard deviations and length are the
+medians of those pairs. An image that jitters shows it in all of its pairs, its partners in one.
 """
 
 from __future__ import annotations
@@ -32,8 +36,8 @@ from .adjustment import (
     Sums,
     estimate,
 )
-from .align import CAREFUL_SIGMA, RPC_SHIFT, RPC_TILT
-from .alignment import ViewFit
+from .align import CAREFUL_SIGMA
+from .alignment import ViewFit, rpc_prior
 from .gcp_checks import BLUNDER_FLOOR
 from .lack_of_fit import shared_spread, with_shared_errors
 from .line_fit import (
@@ -155,12 +159,6 @@ class SiteFit:
 
 def _six(k: int) -> NDArray[np.int64]:
     return np.arange(6 * k, 6 * k + 6)
-
-
-def rpc_prior(fit: ViewFit) -> Floats:
-    """Covariance [6, 6] px² of what an RPC is off, in the image's own coordinates."""
-    tilt = (RPC_TILT * fit.scale) ** 2
-    return np.diag([tilt, tilt, RPC_SHIFT**2] * 2)
 
 
 @dataclass(frozen=True, eq=False)

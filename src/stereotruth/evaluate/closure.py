@@ -35,9 +35,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ..align.adjustment import PairEquations, estimate, parameters_of, read_equations
-from ..align.alignment import Alignment, over_the_image
-from ..align.site_fit import SiteLines, rpc_prior
+from ..align.adjustment import PairEquations, estimate, read_equations
+from ..align.alignment import Alignment, over_the_image, parameters_of, rpc_prior
+from ..align.site_fit import SiteLines
 from ..core.errors import InputError
 from ..core.numerics.bilinear import between_four
 from ..core.products.files import atomic_file, sealed
@@ -314,7 +314,7 @@ def _pairs(triplet: Triplet) -> tuple[_AlignedPair, ...]:
     """The alignments of a triplet, A-B, B-C, A-C."""
     found = []
     for pair in (triplet.ab, triplet.bc, triplet.ac):
-        alignment, ties = Alignment.load(pair.alignment), read_equations(pair.equations)[0]
+        alignment, ties = Alignment.read(pair.alignment), read_equations(pair.equations)[0]
         if ties is not None:  # whose parameters are those of the images alone
             left, right = (over_the_image(fit) for fit in alignment.fits)
             alignment = replace(alignment, left_fit=left, right_fit=right)

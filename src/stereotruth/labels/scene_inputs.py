@@ -138,7 +138,7 @@ class SceneInputs:
         uncertainty = LabelUncertainty.none()
         shared_px = 0.0
         if self.alignment is not None:
-            alignment = Alignment.load(self.alignment)
+            alignment = Alignment.read(self.alignment)
             uncertainty = LabelUncertainty.of(alignment, model, self.view)
             shared_px = alignment.shared_px
         if self.lidar_strips is not None:

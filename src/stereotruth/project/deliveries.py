@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rasterio.errors import RasterioError
 
-from ..align.gcp_checks import open_view
+from ..align.images import open_view
 from ..core.errors import InputError
 from ..core.products.folders import files_below
 from ..core.products.ungeoreferenced import open_raster

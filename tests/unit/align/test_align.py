@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stereotruth.align.align import RPC_SHIFT, align, from_rpcs, write_alignment
-from stereotruth.align.alignment import Alignment
+from stereotruth.align.align import align, from_rpcs, write_alignment
+from stereotruth.align.alignment import RPC_SHIFT, Alignment
 from stereotruth.align.figures import draw_residuals
 from stereotruth.core.errors import InputError
 from stereotruth.sensor.rpc import SensorModel
@@ -257,7 +257,7 @@ def test_without_gcps_the_rpcs_stand_with_their_uncertainty(images, tmp_path):
     files = [tmp_path / name for name in ("a.json", "r.csv", "f.png")]
     write_alignment(alignment, *files[:2])
     draw_residuals(alignment, files[2])
-    again = Alignment.load(files[0])
+    again = Alignment.read(files[0])
     assert again.to_dict() == alignment.to_dict()
     assert np.isnan(again.left_fit.sigma0) and np.isnan(again.left_fit.rms("after"))
 

@@ -78,10 +78,10 @@ def test_columns_are_those_of_either_form(tmp_path):
 
 def test_alignments_that_are_none_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such alignment"):
-        Alignment.load(tmp_path / "none.json")
+        Alignment.read(tmp_path / "none.json")
     (tmp_path / "x.json").write_text("{}")
     with pytest.raises(InputError, match=r"x\.json: no alignment"):
-        Alignment.load(tmp_path / "x.json")
+        Alignment.read(tmp_path / "x.json")
 
 
 def test_more_points_than_anybody_measures_are_refused_by_number_at_once(tmp_path):

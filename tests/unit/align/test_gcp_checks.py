@@ -8,7 +8,7 @@ import rasterio
 from rasterio.transform import Affine
 
 from stereotruth.align.align import align
-from stereotruth.align.gcp_checks import open_view
+from stereotruth.align.images import open_view
 from stereotruth.core.errors import InputError
 from stereotruth.sensor.rpc import RPC
 

@@ -13,7 +13,7 @@ import pytest
 from stereotruth.align.adjustment import Equations, Estimate, estimate
 from stereotruth.align.align import align
 from stereotruth.align.alignment import GcpResidual
-from stereotruth.align.lidar_checks import (
+from stereotruth.align.doubts import (
     LIDAR_SIGMA_M,
     doubt_at_gcps,
     doubt_by_rpcs,

@@ -11,9 +11,9 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from stereotruth.align.alignment import Alignment, GcpResidual
+from stereotruth.align.doubts import lines_of_sight, scatter_by_heights
 from stereotruth.align.figures import draw_refinement
 from stereotruth.align.label_uncertainty import label_sigma
-from stereotruth.align.lidar_checks import lines_of_sight, scatter_by_heights
 from stereotruth.align.refine import refine, write_refinement
 from stereotruth.core.errors import InputError
 from stereotruth.epipolar.fit import fit_epipolar
@@ -288,7 +288,7 @@ def test_json_keeps_the_refinement(found, images, tmp_path):
     files = [tmp_path / name for name in ("a.json", "o.csv", "f.png")]
     write_refinement(refined, observations, *files[:2])
     draw_refinement(refined, *files[1:], images[0])
-    again = Alignment.load(files[0])
+    again = Alignment.read(files[0])
     assert again.to_dict() == refined.to_dict()
     assert (again.covariance == refined.covariance).all()
     with files[1].open(newline="") as stream:

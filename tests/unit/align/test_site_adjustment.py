@@ -173,9 +173,9 @@ def test_an_image_that_nothing_places_is_refused_and_the_others_are_made(tmp_pat
         write_site(record, file)
         if "D" in pair.names:
             with pytest.raises(InputError, match=f"{pair.scene}: image D: neither.*Remedy: remove"):
-                Alignment.load(file)
+                Alignment.read(file)
         else:
-            assert Alignment.load(file).scene == pair.scene
+            assert Alignment.read(file).scene == pair.scene
 
 
 def test_an_image_without_tie_points_rests_on_its_control_points(tmp_path):

@@ -156,7 +156,7 @@ def test_an_offset_of_one_pair_is_beyond_the_uncertainty(tmp_path):
 def test_the_alignment_counts_where_an_image_has_two_corrections(tmp_path):
     triplet = triplet_of(tmp_path, noise=NOISE)
     _, alike = closure_of_labels(triplet)
-    record = Alignment.load(triplet.bc.alignment)
+    record = Alignment.read(triplet.bc.alignment)
     affine = record.left_fit.affine + np.array([[0.0, 0.0, 1e-3], [0.0, 0.0, 0.0]])
     fit = replace(record.left_fit, affine=affine)
     moved = replace(record, left=SensorModel(record.left.rpc, affine), left_fit=fit)
