@@ -29,7 +29,7 @@ rule align:
         strict=SETTINGS.strict,
         epoch=lambda w: epoch_of(w.city),
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
-        code=source_digest("stereotruth.align.align", "stereotruth.align.align"),
+        code=source_digest("stereotruth.align.align"),
     message:
         "Aligning scene {wildcards.scene} to its ground control points"
     script:

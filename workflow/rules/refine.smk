@@ -6,6 +6,7 @@ rule refine:
         right_mask=given_in("right_mask"),
         alignment=rules.align.output.alignment,
         points=point_stores,
+        surface=surface_of,
     output:
         alignment="results/refine/{city}/{scene}/alignment.json",
         observations=report(
@@ -33,8 +34,6 @@ rule refine:
         bands=SETTINGS.rectify.model_dump(),
         code=source_digest(
             "stereotruth.align.refine",
-            "stereotruth.align.refine",
-            "stereotruth.align.adjustment",
         ),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"

@@ -1,7 +1,7 @@
 """One scene's residuals of the ground control points, drawn."""
 
-from stereotruth.align.figures import draw_residuals
 from stereotruth.align.alignment import Alignment
+from stereotruth.align.figures import draw_residuals
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 

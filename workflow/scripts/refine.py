@@ -1,9 +1,8 @@
 """What is left between one scene's LiDAR and its two images, taken out of the alignment."""
 
-from stereotruth.align.alignment import Alignment
-from stereotruth.align.refine import refine
-from stereotruth.align.refine import write_refinement
 from stereotruth.align.adjustment import write_equations
+from stereotruth.align.alignment import Alignment
+from stereotruth.align.refine import refine, write_refinement
 from stereotruth.core.config.labels import Rectify
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
@@ -26,6 +25,7 @@ if __name__ == "__main__":
             given.left[0],
             given.right[0],
             given.points,
+            given.surface,
             masks=masks,
             bands=Rectify(**snakemake.params.bands),
             strict=snakemake.params.strict,

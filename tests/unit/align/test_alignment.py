@@ -12,6 +12,7 @@ import pytest
 from stereotruth.align.align import write_alignment
 from stereotruth.align.alignment import Alignment
 from stereotruth.align.figures import draw_residuals
+from stereotruth.core.errors import InputError
 
 from ...synthetic.surveyed_pair import make_gcps, run
 
@@ -53,3 +54,11 @@ def test_an_edited_alignment_is_used_as_it_is_and_told(images, tmp_path, caplog)
     moved = Alignment.read(file)
     assert moved.right_fit.affine[0][2] == values["right"]["affine"][0][2]
     assert "alignment.json: edited since it was made" in caplog.text
+
+
+def test_alignments_that_are_none_are_refused(tmp_path):
+    (tmp_path / "x.json").write_text("{}")
+    for name in ("none.json", "x.json"):
+        with pytest.raises(InputError) as caught:
+            Alignment.read(tmp_path / name)
+        assert name in str(caught.value) and "Remedy: " in str(caught.value)
