@@ -25,7 +25,6 @@ from synthetic_pairs import (
     label_by,
     noise,
     sun_an_hour_later,
-    surface_of,
 )
 
 from stereocities.cities import Canopy, CitySpec, Jitter, SceneSpec, ViewSpec, training_city
@@ -242,11 +241,6 @@ class Scene:
         return sorted(made.glob("*.points"))
 
     @property
-    def surface(self) -> Path:
-        """The surface of the points."""
-        return surface_of(self.images, self.stores, self.stores[0].parent)
-
-    @property
     def points(self) -> list[Path]:
         """Point stores, by the name that a :class:`synthetic_pairs.Pair` has for them."""
         return self.stores
@@ -416,7 +410,7 @@ def _compared(
     made = COMPARED / f"{key}-{code}"
     if not made.is_dir():
         with atomic_folder(made) as scratch:
-            refined, _ = refine(alone, *scene.images, scene.stores, scene.surface, provenance={})
+            refined, _ = refine(alone, *scene.images, scene.stores, provenance={})
             label_by(refined, scene.images, scene.stores, scratch, settings, workers=workers)
             write_grid_truth(scene.city, scene.spec, scratch / "epipolar.json",
                              scratch / "truth.zarr", workers=workers)  # fmt: skip

@@ -30,7 +30,7 @@ import yaml
 import zarr
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
-from synthetic_pairs import SEED, VIEWS, fly, label_by, surface_of
+from synthetic_pairs import SEED, VIEWS, fly, label_by
 
 from stereocities.__main__ import make_scene
 from stereocities.cities import CitySpec, FlightStrip, Jitter, SceneSpec, ViewSpec, training_city
@@ -116,8 +116,7 @@ def strips(given: argparse.Namespace) -> None:
             out = folder / f"labels_{name}"
             out.mkdir(exist_ok=True)
             alone = align(*images, folder / "gcps.csv", provenance={})
-            surface = surface_of(images, points, out)
-            alignment, _ = refine(alone, *images, points, surface, provenance={})
+            alignment, _ = refine(alone, *images, points, provenance={})
             label_by(alignment, images, points, out, LabelSettings(), workers=given.threads)
             truth = out / "epipolar.json", out / "truth.zarr"
             write_grid_truth(city, city.scenes[0], *truth, workers=given.threads)

@@ -338,9 +338,7 @@ def trial(draw: Draw, gcps: int, with_labels: bool, folder: Path) -> Row:
     alone = scene.align(gcps)
     row["alone"] = _of_errors(scene, alone)
     try:
-        refined, observations = refine(
-            alone, *scene.images, scene.stores, scene.surface, provenance={}
-        )
+        refined, observations = refine(alone, *scene.images, scene.stores, provenance={})
     except InputError as error:
         return row | {"refused": str(error), "seconds": time.process_time() - start}
     row["applied"] = bool(refined.refinement["applied"])

@@ -15,13 +15,14 @@ from __future__ import annotations
 import argparse
 import csv
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from figures import print_table
-from synthetic_pairs import VIEWS, far_apart, fly, rectify_by, surface_of
+from synthetic_pairs import VIEWS, far_apart, fly, rectify_by
 
 from stereocities.site_images import (
     image_truth,
@@ -43,9 +44,13 @@ from stereotruth.core.products.provenance import source_digest
 from stereotruth.evaluate.closure import PairFiles, closure_of_labels, figures, triplets_of
 from stereotruth.labels.project import project_scene
 from stereotruth.labels.scene_inputs import SceneInputs
+from stereotruth.lidar.point_store import open_stores
 from stereotruth.sensor.pair_quality import quality_of
 from stereotruth.sensor.rpc import SensorModel
+from stereotruth.sensor.shown_ground import GroundOfImages
 from stereotruth.sensor.site_pairs import SiteImage, SitePair, pairs_of_site
+from stereotruth.surface.make_surface import make_surface
+from stereotruth.surface.scale import ground_cell
 
 SEED = 2030
 SPACING_M = 0.5  # of the LiDAR's points
@@ -129,12 +134,6 @@ def label_error_px(
     return float(np.mean(np.abs(left - right - exact)))
 
 
-def surface_of_site(folder: Path) -> Path:
-    """The surface of a site's points, for all of its images."""
-    stores = (folder / "points").glob("*.points")
-    return surface_of(sorted(folder.glob("*.tif")), list(stores), folder)
-
-
 def refined(folder: Path, names: tuple[str, str], count: int) -> ScenePair:
     """Files of a pair, aligned and refined by itself as the workflow does for a site."""
     gcps = some_points(folder, count)
@@ -148,8 +147,7 @@ def refined(folder: Path, names: tuple[str, str], count: int) -> ScenePair:
         except InputError:
             start = from_rpcs(*files, provenance={})
         stores = sorted((folder / "points").glob("*.points"))
-        surface = surface_of_site(folder)
-        alignment, seen = refine(start, *files, stores, surface, alone=False, provenance={})
+        alignment, seen = refine(start, *files, stores, alone=False, provenance={})
         with atomic_folder(made) as scratch:
             alignment.save(scratch / "alignment.json")
             ties = seen.of_images if seen else None
@@ -260,13 +258,23 @@ def labelled(
     )
 
 
+def surface_of(folder: Path, images: Sequence[Path]) -> Path:
+    """The surface of a site's points, as the workflow makes it for all of its images."""
+    out = folder / f"site-{source_digest('stereotruth.surface.make_surface')[:8]}.surface"
+    if not out.is_dir():
+        ground = GroundOfImages.open(list(images))
+        stores = open_stores(sorted((folder / "points").glob("*.points")))
+        make_surface(stores, out, cell=ground_cell(ground.pixel_deg), ground=ground)
+    return out
+
+
 def pairs_by_case(number: int, options: argparse.Namespace) -> dict[str, list[PairFiles]]:
     """The labelled pairs of a site, by their alignment: of all images together, and separate."""
     site = drawn_site(number, SEED, images=options.images, side_px=options.side)
     folder = site_folder(site, number, options)
     chosen = [(pair.left, pair.right) for pair in pairs_of(site, folder, options.pairs)]
     pairs = [refined(folder, names, options.points) for names in chosen]
-    surface = surface_of_site(folder)
+    surface = surface_of(folder, [folder / f"{image.name}.tif" for image in site.images])
     adjusted = adjust_site(site.city.name, pairs)
     found: dict[str, list[PairFiles]] = {case: [] for case in CASES}
     for pair in pairs:

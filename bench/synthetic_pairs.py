@@ -41,12 +41,9 @@ from stereotruth.labels.project import MAX_POINTS, SHARD, project_scene
 from stereotruth.labels.recipe import label_window
 from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import Points, PointStore, open_stores
+from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.strip_comparison import compare_strips
 from stereotruth.sensor.image_reader import open_pair
-from stereotruth.sensor.shown_ground import GroundOfImages
-from stereotruth.surface.make_surface import make_surface
-from stereotruth.surface.scale import ground_cell
 
 VIEWS = ("left", "right")
 SEED = 12  # of the fresh cities, their control points' noise and the faults of images
@@ -175,16 +172,6 @@ class Condition:
         return change_images(images, [self.change], rng, folder)
 
 
-def surface_of(images: Sequence[Path], stores: Sequence[Path], folder: Path) -> Path:
-    """The surface of points, made once in a folder as the workflow makes it for these images."""
-    out = folder / f"{source_digest('stereotruth.surface.make_surface')[:8]}.surface"
-    if not out.is_dir():
-        ground = GroundOfImages.open(list(images))
-        cell = ground_cell(ground.pixel_deg)
-        make_surface(open_stores(sorted(stores)), out, cell=cell, ground=ground)
-    return out
-
-
 def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], folder: Path) -> None:
     """Align a pair, refine that by the points if there are any, and rectify it.
 
@@ -192,7 +179,7 @@ def rectify_pair(images: Sequence[Path], gcps: Path, stores: Sequence[Path], fol
     """
     alignment = align(*images, gcps)
     if stores:
-        alignment, _ = refine(alignment, *images, stores, surface_of(images, stores, folder))
+        alignment, _ = refine(alignment, *images, stores)
     rectify_by(alignment, images, folder)
 
 

@@ -6,7 +6,6 @@ rule refine:
         right_mask=given_in("right_mask"),
         alignment=rules.align.output.alignment,
         points=point_stores,
-        surface=surface_of,
     output:
         alignment="results/refine/{city}/{scene}/alignment.json",
         observations=report(
@@ -32,9 +31,7 @@ rule refine:
         strict=SETTINGS.strict,
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
         bands=SETTINGS.rectify.model_dump(),
-        code=source_digest(
-            "stereotruth.align.refine",
-        ),
+        code=source_digest("stereotruth.align.refine"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
     script:

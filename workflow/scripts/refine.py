@@ -25,7 +25,6 @@ if __name__ == "__main__":
             given.left[0],
             given.right[0],
             given.points,
-            given.surface,
             masks=masks,
             bands=Rectify(**snakemake.params.bands),
             strict=snakemake.params.strict,

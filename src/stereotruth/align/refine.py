@@ -34,7 +34,6 @@ from ..core.numerics.robust import robust_sigma
 from ..core.products.files import write_table
 from ..lidar.point_store import PointStore, open_stores
 from ..sensor.image_reader import Source, open_pair
-from ..surface.surface_store import SurfaceStore
 from .adjustment import (
     LEAST_SIGMA,
     Equations,
@@ -169,7 +168,6 @@ def _search(
     alignment: Alignment,
     sources: tuple[Source, Source],
     stores: Sequence[PointStore],
-    surface: SurfaceStore,
     prior: Floats,
 ) -> _Found | str:
     """Tie points, estimate, refined alignment and :func:`agreement_of_halves`; or why not."""
@@ -185,7 +183,7 @@ def _search(
             sites = choose_sites(current.left, current.right, sizes, stores, height)
             if not sites:
                 return "there is no ground that both images show and the LiDAR covers"
-            places = find_places(current.left, current.right, sources, surface, sites)
+            places = find_places(current.left, current.right, sources[0], stores, sites)
             found_at = parameters
             if len(places) < MIN_PLACES:
                 return f"only {len(places)} places of smooth, textured ground"
@@ -348,7 +346,6 @@ def refine(
     left_image: str | Path,
     right_image: str | Path,
     point_stores: Sequence[str | Path],
-    surface: str | Path,
     *,
     masks: tuple[str | Path | None, str | Path | None] = (None, None),
     bands: Rectify | None = None,
@@ -378,7 +375,7 @@ def refine(
         ]
         doubts = [text for text in doubts if text]
         alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
-        result = _search(alignment, (left, right), stores, SurfaceStore(surface), prior)
+        result = _search(alignment, (left, right), stores, prior)
         if not isinstance(result, str):
             result, in_plan = _placed(alignment, result, (left, right), stores)
     record_of = dict(provenance or alignment.provenance)

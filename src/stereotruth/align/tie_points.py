@@ -2,7 +2,7 @@
 
 The scene is sampled at a fixed number of sites, spread evenly over the ground that both images and
 the LiDAR cover, whatever its size. In a site, places are windows on a plane of the points, whose
-pixels take part if nothing but the plane is seen there (:mod:`.tie_sites`). The plane maps the
+pixels take part if nothing but the plane is seen there (:mod:`.tie_planes`). The plane maps the
 left window to the right image, and robust least-squares matching finds by how much the right image
 shows the same elsewhere (:mod:`.least_squares_matching`): the tie point's shift.
 
@@ -26,7 +26,8 @@ from ..epipolar.resampling import ANTIALIAS
 from ..sensor.image_reader import Source
 from ..sensor.rpc import SensorModel
 from .least_squares_matching import least_squares_match, warp_patch
-from .tie_sites import HALF, MIN_CLEAR, SITE, Places
+from .tie_planes import HALF
+from .tie_sites import MIN_CLEAR, SITE, Places
 
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]

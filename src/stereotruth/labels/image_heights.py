@@ -5,6 +5,9 @@ surface is that of :mod:`stereotruth.surface.surface`, as for the labels of a pa
 undecided triangle may be higher on the ray, the pixel has no height, unless the tops of a crown lie
 there (:mod:`.crowns`). Multi-view stereo, radiance
 fields and splatting work on the originals, which no rectification has touched.
+
+The facets' vertices are projected as (col, row, col - disparity, row), with the disparity that a
+height has in the pair of BASE_OVER_HEIGHT, by which all tolerances of the surface count.
 """
 
 from __future__ import annotations
@@ -32,10 +35,11 @@ from ..lidar.point_store import VEGETATION_CLASSES, PointStore, open_stores
 from ..sensor.rpc import SensorModel
 from ..sensor.shown_ground import GroundOfImages
 from ..surface.facet_values import PixelValues
-from ..surface.image_surface import ImageProjection
-from ..surface.raster import PRISM_IN_LEFT, VISIBLE, SeenSurface
+from ..surface.raster import PRISM_IN_LEFT, VISIBLE, ProjectedSurface, SeenSurface
+from ..surface.region import SQUARE_BITS, Region
 from ..surface.scale import BASE_OVER_HEIGHT, PART
-from ..surface.surface_store import SurfaceStore
+from ..surface.surface_store import Box, SurfaceStore
+from ..surface.vertices import Vertices
 from .crowns import HIGHER_PX, HIGHER_REACH, NearestTops
 from .pixel_scale import PixelScale
 
@@ -51,6 +55,7 @@ CROWN_CLASSES = (0, 1, *VEGETATION_CLASSES)  # ASPRS, of what may be a crown; 0,
 # lie within half a pixel of the planes around: 68 to 77 % of the crowns' pixels lie within σ then,
 # at 0.5 to 2 points/m² in simulated woods.
 ON_FACETS = 0.5
+_RISE = 10_000  # lattice steps between two heights, for what one of them changes
 LAYERS = {
     "height": Layer("float32", np.nan, {
         "units": "m", "long_name": "height above the WGS 84 ellipsoid of what the pixel's centre "
@@ -93,6 +98,11 @@ class ImageInputs:
     surface: SurfaceStore
     fit: ViewFit | None = None
     of_lines: Floats = field(default_factory=lambda: np.zeros((2, 2)))
+
+    @cached_property
+    def reference_m(self) -> float:
+        """Height in the middle of the RPC's range."""
+        return float(self.sensor.rpc.height_off)
 
     @property
     def made_of(self) -> dict[str, str]:
@@ -155,6 +165,22 @@ class ImageInputs:
         """By which a crown's contour may lie beyond its last points: the diagonal of a spacing."""
         return int(np.sqrt(2) * self.scale.spacing_px)
 
+    def with_rise(
+        self, lon_q: Ints, lat_q: Ints, h_q: Ints, lifted: NDArray[np.bool_]
+    ) -> tuple[Floats, NDArray[np.float32]]:
+        """See :class:`stereotruth.surface.raster.Projection`: (col, row, col - disparity, row)."""
+        xy = self._project(lon_q, lat_q, h_q)
+        rise = np.empty(xy.shape, np.float32)
+        higher = self._project(lon_q[lifted], lat_q[lifted], h_q[lifted] + _RISE)
+        rise[:, lifted] = (higher - xy[:, lifted]) / _RISE
+        return xy, rise
+
+    def _project(self, lon_q: Ints, lat_q: Ints, h_q: Ints) -> Floats:
+        height = h_q * LATTICE_M
+        col, row = self.sensor.project(lon_q * LATTICE_DEG, lat_q * LATTICE_DEG, height)
+        disparity = (height - self.reference_m) * self.scale.px_per_m
+        return np.stack([col, row, col - disparity, row])
+
     def covariance(self, rows: slice, cols: slice) -> Floats:
         """[2, 2] px² of the correction in the middle of a block."""
         if self.fit is None:
@@ -169,12 +195,18 @@ def heights_of_block(inputs: ImageInputs, rows: slice, cols: slice) -> dict[str,
     core, covariance = (slice(margin, -margin),) * 2, inputs.covariance(rows, cols)
     rows, cols = (slice(part.start - margin, part.stop + margin) for part in (rows, cols))
     box = inputs.box(rows, cols)
-    projection = ImageProjection(inputs.sensor, inputs.pixel_m)
-    facets = None if box is None else projection.seen(inputs.surface, box, rows, cols)
-    if facets is None:
+    blocks = () if box is None else inputs.surface.blocks(box)
+    if not blocks:
         return None
+    around = inputs.surface.window(blocks)
+    surface = around.surface(_region(inputs, around.vertices, box))
+    if not surface.vertices.x.size:
+        return None
+    shape, first = (rows.stop - rows.start, cols.stop - cols.start), (rows.start, cols.start)
+    projected = ProjectedSurface.of(surface, inputs, first)
+    facets = projected.seen(shape, inputs.scale.px_per_m)
     crowns = _CrownPixels.of(facets, inputs.scale)
-    status = np.full(facets.visibility.shape, np.uint8(NO_POINTS))
+    status = np.full(shape, np.uint8(NO_POINTS))
     status[facets.visibility == VISIBLE] = MEASURED
     status[facets.visibility == PRISM_IN_LEFT] = UNDECIDED
     on_crown = np.isin(facets.surface_class, VEGETATION_CLASSES)
@@ -212,6 +244,24 @@ class _CrownPixels:
         for nothing."""
         with np.errstate(invalid="ignore"):
             return box_max(self.disparity, reach) > disparity + HIGHER_PX
+
+
+def _region(inputs: ImageInputs, vertices: Vertices, box: Box) -> Region:
+    """The squares of a box (west, south, east, north, degrees) from the vertices' origin on."""
+    size = [int(values.max()) >> SQUARE_BITS for values in (vertices.y, vertices.x)]
+    squares = np.zeros((size[0] + 1, size[1] + 1), np.bool_)
+    part = []
+    for low, high, q, at, side in (
+        (box[1], box[3], vertices.lat_q[0], vertices.y[0], inputs.surface.scale.cell[1]),
+        (box[0], box[2], vertices.lon_q[0], vertices.x[0], inputs.surface.scale.cell[0]),
+    ):
+        first, last = (
+            int(np.floor((edge / LATTICE_DEG - q) / side * PART + at)) >> SQUARE_BITS
+            for edge in (low, high)
+        )
+        part.append(slice(max(first - 1, 0), max(last + 2, 0)))
+    squares[part[0], part[1]] = True
+    return Region(squares)
 
 
 def _layers(

@@ -25,8 +25,6 @@ from ...synthetic.images import write_image
 from ...synthetic.pictures import colours_in, read_picture, share_of
 from ...synthetic.textured_pair import NONE, SIZE, TRUE, start, surface
 
-SHIFT = np.array([0.0, 0.0, 1.0])
-
 
 def texture(east: np.ndarray, north: np.ndarray) -> np.ndarray:
     """Smooth noise on the ground: unlike a few waves, it is itself only where it is."""
@@ -161,14 +159,6 @@ def test_what_both_images_share_stays_as_the_gcps_say(images, points):
     assert max(relative_error(refined)) < 0.02
 
 
-def test_a_simpler_model_is_refined_too(images, points):
-    planted = start(NONE, PLANTED * SHIFT, 0.5, "shift")
-    fixed = np.diag([0.0, 0.0, 0.25] * 2)
-    fits = [replace(fit, covariance=fixed) for fit in planted.fits]
-    refined, _ = refine(replace(planted, left_fit=fits[0], right_fit=fits[1]), *images, [points])
-    assert max(relative_error(refined)) < 0.03
-
-
 @pytest.mark.slow
 def test_no_tie_point_lies_under_a_mask(images, points, tmp_path):
     cloud = np.zeros(SIZE[::-1], np.uint8)
@@ -241,7 +231,7 @@ def test_lidar_beside_its_place_is_doubted(images, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("metres", "doubted"), [(0.0, False), (0.4, False), (-30.0, True)])
+@pytest.mark.parametrize(("metres", "doubted"), [(0.4, False), (-30.0, True)])
 def test_heights_without_control_points_are_held_against_the_rpcs(
     images, tmp_path, metres, doubted
 ):
@@ -262,7 +252,7 @@ def test_heights_without_control_points_are_held_against_the_rpcs(
     assert np.abs(np.subtract(raised, TRUE[0].project(LON, LAT, HEIGHT))).max() < 1.0
 
 
-@pytest.mark.parametrize(("metres", "told"), [(0.02, False), (0.15, False), (0.4, True)])
+@pytest.mark.parametrize(("metres", "told"), [(0.15, False), (0.4, True)])
 def test_heights_that_scatter_more_than_lidar_tell_of_other_ground(metres, told):
     """As of images that were cut, with the RPCs of before: no point says where they look."""
     alignment, rng = start(NONE, NONE, 10.0), np.random.default_rng(1)
@@ -301,8 +291,7 @@ def test_json_keeps_the_refinement(found, images, tmp_path):
         picture, (np.array([0.36, 0.72]) * len(picture)).astype(int)
     )
     assert share_of(upper, "C0") > 1e-3  # arrows of the sites
-    assert colours_in(over_image) > 2e-3  # tie points over the image
-    assert colours_in(lower) > 2e-3  # and histograms below
+    assert min(colours_in(over_image), colours_in(lower)) > 2e-3  # tie points, histograms
     unrefined = replace(refined, refinement={"applied": False, "reason": "x"})
     write_refinement(unrefined, None, *files[:2])
     draw_refinement(unrefined, *files[1:], images[0])
