@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from ..core.numerics.robust import TUKEY, median_and_nmad, robust_sigma, tukey_weights
 from ..core.products.files import atomic_file, read_record, sealed
@@ -169,11 +170,15 @@ class Estimate:
     statistic: float
     freedom: int
     contradiction: float
-    contradiction_freedom: int
     root: Floats
     normal: Floats
     alone: Floats
     information: Floats
+
+    @property
+    def chance(self) -> float:
+        """Probability of so large a change by chance."""
+        return float(f"{chdtrc(self.freedom, self.statistic):.3g}")
 
     def amount_along(self, direction: Floats) -> tuple[float, float]:
         """By how much of a direction [12] observations and prior differ, and its deviation.
@@ -359,7 +364,6 @@ def estimate(equations: Equations, prior: Floats, common_px: float = 0.0) -> Est
         float(np.sum(squares / values)),
         int(seen.sum()),
         float(np.sum(squares / (values + values**2))),
-        int(seen.sum()),
         root,
         normal,
         root @ alone,

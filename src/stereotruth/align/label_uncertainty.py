@@ -101,14 +101,6 @@ def _of_lines(
     return effects @ covariance @ np.swapaxes(effects, -1, -2)
 
 
-def label_sigma(
-    alignment: Alignment, model: EpipolarModel, x: ArrayLike, y: ArrayLike
-) -> tuple[Floats, Floats, Floats]:
-    """Standard uncertainty (px) of a ground point's disparity, x and y at left epipolar (x, y)."""
-    variances = np.diagonal(label_covariance(alignment, model, x, y), axis1=-2, axis2=-1)
-    return tuple(np.sqrt(np.maximum(np.moveaxis(variances, -1, 0), 0.0)))
-
-
 @dataclass(frozen=True, eq=False)
 class LabelUncertainty:
     """Covariance (px²) that the alignment gives to labels, on nodes over the grid of a view.

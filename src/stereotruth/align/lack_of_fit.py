@@ -258,6 +258,5 @@ def _counted(
         statistic=float(np.sum(squares / values)),
         freedom=int(seen.sum()),
         contradiction=float(np.sum(squares / (values + values**2))),
-        contradiction_freedom=int(seen.sum()),
     )
     return counted, replace(shared, label_px=label)

@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from ..core.config.labels import Rectify
 from ..core.errors import InputError
@@ -126,7 +125,7 @@ def _record(
         "sites": int(np.unique(ties.site[used]).size),
         "chi_square": round(found.statistic, 2),
         "degrees_of_freedom": found.freedom,
-        "probability_by_chance": _chance(found),
+        "probability_by_chance": found.chance,
         "deviation_over_that_of_the_match": found.ratio.round(3).tolist(),
         "shared_in_a_site": found.site_ratio.round(3).tolist(),
         "sigma_shared_by_all_px": found.shared.round(4).tolist(),
@@ -138,10 +137,6 @@ def _record(
         "lidar_height: m, of LiDAR minus images, and from what on a fault is told; place_in_plan: "
         "m (east, north), see plan_place",
     }
-
-
-def _chance(found: Estimate) -> float:
-    return float(f"{chdtrc(found.freedom, found.statistic):.3g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +173,8 @@ def _search(
     radius = FINE
     current = alignment
     for number in range(ROUNDS):
-        if places is None or _moved_left(alignment, parameters - found_at) > MOVED:
+        moved = alignment.left_fit.moved(parameters[:6] - found_at[:6])
+        if places is None or _changes(alignment.left_fit, moved)["largest"] > MOVED:
             height = alignment.reference_height
             sites = choose_sites(current.left, current.right, sizes, stores, height)
             if not sites:
@@ -247,21 +243,6 @@ def _search(
     return _Found(observations, found, shared, lines, current, halves, sigma)
 
 
-def _placed(
-    start: Alignment, result: _Found, sources: tuple[Source, Source], stores: Sequence[PointStore]
-) -> tuple[_Found, dict[str, Any]]:
-    """What tie points tell, with the place in plan, and the figures of it."""
-    found, figures, seen = place_pair(result.alignment, result.estimate, sources, stores)
-    of_images = replace(result.observations.of_images, in_plan=seen)
-    placed = replace(
-        result,
-        observations=replace(result.observations, of_images=of_images),
-        estimate=found,
-        alignment=with_corrections(start, found.parameters, result.lines.corrections),
-    )
-    return placed, figures
-
-
 def _discord(observations: Observations) -> str:
     """Why tie points tell nothing, or an empty string."""
     used = observations.used
@@ -305,7 +286,7 @@ def _widening(
     """What the covariance is multiplied by where there are doubts: which of two is wrong is not
     known, nor by how much (Birge's ratio). Adds a doubt to ``doubts`` where the ground may be
     another."""
-    ratio = max(found.contradiction / found.contradiction_freedom, 1.0) if doubts else 1.0
+    ratio = max(found.contradiction / found.freedom, 1.0) if doubts else 1.0
     if any(fit.gcps for fit in refined.fits):
         return ratio
     scatter, explained = scatter_by_heights(refined, *observations.after[observations.used].T)
@@ -320,11 +301,6 @@ def _widening(
     return max(ratio, (scatter / explained) ** 2)
 
 
-def _still_true(warnings: Sequence[str], unrefined: bool) -> list[str]:
-    """Warnings of the alignment before: once refined, places are known by the LiDAR."""
-    return [text for text in warnings if unrefined or text != PLACES_BY_RPCS]
-
-
 def _warn(doubts: Sequence[str], strict: bool, image: str | Path, of: str) -> None:
     for text in doubts:
         log.warning("warning: %s", text)
@@ -334,11 +310,6 @@ def _warn(doubts: Sequence[str], strict: bool, image: str | Path, of: str) -> No
             file=image,
             remedy="check LiDAR and GCPs, or set strict or alignment.refine to false",
         )
-
-
-def _moved_left(alignment: Alignment, parameters: Floats) -> float:
-    fit = alignment.left_fit
-    return _changes(fit, fit.moved(parameters[:6]))["largest"]
 
 
 def refine(
@@ -377,7 +348,14 @@ def refine(
         alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)
         if not isinstance(result, str):
-            result, in_plan = _placed(alignment, result, (left, right), stores)
+            tied = result.alignment, result.estimate
+            found, in_plan, seen = place_pair(*tied, (left, right), stores)
+            observations = result.observations
+            observations = replace(
+                observations, of_images=replace(observations.of_images, in_plan=seen)
+            )
+            refined = with_corrections(alignment, found.parameters, result.lines.corrections)
+            result = replace(result, observations=observations, estimate=found, alignment=refined)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
         if not gcps and alone:
@@ -398,7 +376,12 @@ def refine(
     observations, found, refined = result.observations, result.estimate, result.alignment
     reason = _objection(result, bool(gcps))
     record = _record(alignment, refined, observations, found, reason)
-    record |= _misfits(result, reason)
+    record |= {
+        "by_line": result.lines.figures(),
+        "shared_by_near_sites": result.shared.figures(),
+        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
+        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
+    }
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
@@ -423,13 +406,15 @@ def refine(
     if not gcps and not doubts:
         doubts = [HEIGHTS_BY_RPCS.format(offset.told_from_m)]
         log.warning("warning: %s", *doubts)
+    # once refined, places are known by the LiDAR
+    told = [text for text in alignment.warnings if reason or text != PLACES_BY_RPCS]
     height = alignment.reference_height
     if not gcps:  # it was that of the RPCs, far off perhaps
         height = round(float(observations.ties.height[observations.used].mean()), 3)
     refined = replace(
         refined,
         reference_height=height,
-        warnings=(*_still_true(alignment.warnings, bool(reason)), *doubts),
+        warnings=(*told, *doubts),
         left_fit=replace(refined.left_fit, covariance=covariance[:6, :6]),
         right_fit=replace(refined.right_fit, covariance=covariance[6:, 6:]),
         cross_covariance=covariance[:6, 6:],
@@ -442,22 +427,12 @@ def refine(
     return refined, observations
 
 
-def _misfits(result: _Found, reason: str) -> dict[str, Any]:
-    """Of a record: what lines and near sites tell; ``reason`` as in :func:`_record`."""
-    return {
-        "by_line": result.lines.figures(),
-        "shared_by_near_sites": result.shared.figures(),
-        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
-        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
-    }
-
-
 def _objection(result: _Found, with_gcps: bool) -> str:
     """Why a refinement is not applied, or an empty string."""
     before, after = result.halves
     # what roofs tell of the place of both images, tie points need not contradict
     told = result.lines.stands_out or bool(result.observations.of_images.in_plan)
-    if _chance(result.estimate) > SIGNIFICANT and not told:
+    if result.estimate.chance > SIGNIFICANT and not told:
         return "the tie points do not contradict the alignment"
     if after >= before and with_gcps:
         return (

@@ -32,7 +32,6 @@ from .site_fit import (
     SiteFit,
     SiteLines,
     fit_site,
-    residual_figures,
 )
 
 log = logging.getLogger("stereotruth")
@@ -192,6 +191,19 @@ def adjust_site(
         "scatter_of_pairs": round(fit.scatter, 4),
         "covariance": {"images": list(fit.names), "values": fit.covariance.tolist()},
         "provenance": dict(provenance or {}),
+    }
+
+
+def residual_figures(values: Floats) -> dict[str, Any]:
+    """Medians and root mean squares of residuals [n, 2] px, along and across the rows."""
+    if not len(values):
+        return {}
+    return {
+        name: {
+            "median": round(float(np.median(values[:, k])), 4),
+            "rms": round(float(np.sqrt(np.mean(values[:, k] ** 2))), 4),
+        }
+        for k, name in enumerate(("disparity", "y_parallax"))
     }
 
 

@@ -425,19 +425,6 @@ def _leave_one_out(
     return out
 
 
-def residual_figures(values: Floats) -> dict[str, Any]:
-    """Medians and root mean squares of residuals [n, 2] px, along and across the rows."""
-    if not len(values):
-        return {}
-    return {
-        name: {
-            "median": round(float(np.median(values[:, k])), 4),
-            "rms": round(float(np.sqrt(np.mean(values[:, k] ** 2))), 4),
-        }
-        for k, name in enumerate(("disparity", "y_parallax"))
-    }
-
-
 @dataclass(frozen=True, eq=False)
 class SiteLines:
     """``corrections`` by number of the images that have one; ``covariance`` [k, 4, 4] px² by scene,

@@ -92,12 +92,6 @@ def test_an_image_tells_how_far_its_sensor_model_is_off(images):
             assert found.edges > 60
 
 
-def test_few_edges_tell_nothing(images):
-    edges = edges_of(points(roofs()), most=8)
-    with open_pair(*images) as (source, _):
-        assert "only" in plan_offset(source, TRUE[0], edges, 4.0)
-
-
 def test_offsets_move_all_images_and_leave_what_binds_them():
     fits = start(NONE, NONE, 1.0).fits
     slopes = [plan_slopes(true, LON, LAT, HEIGHT) for true in TRUE]

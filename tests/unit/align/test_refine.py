@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from stereotruth.align.alignment import Alignment, GcpResidual
 from stereotruth.align.doubts import lines_of_sight, scatter_by_heights
 from stereotruth.align.figures import draw_refinement
-from stereotruth.align.label_uncertainty import label_sigma
+from stereotruth.align.label_uncertainty import label_covariance
 from stereotruth.align.refine import refine, write_refinement
 from stereotruth.core.errors import InputError
 from stereotruth.epipolar.fit import fit_epipolar
@@ -108,7 +108,8 @@ def test_rpcs_alone_are_brought_together(images, points):
     assert max(relative_error(planted)) > 10.0
     assert max(relative_error(refined)) < 0.03
     model = fit_epipolar(refined.left, refined.right, SIZE, SIZE, HEIGHT)
-    disparity, x, y = label_sigma(refined, model, model.shape[1] / 2, model.shape[0] / 2)
+    middle = model.shape[1] / 2, model.shape[0] / 2
+    disparity, x, y = np.sqrt(np.diag(label_covariance(refined, model, *middle)))
     assert disparity < 0.03
     # The common part is seen on slopes only: the uncertainty of the labels' places says so.
     miss = np.subtract(refined.left.project(LON, LAT, HEIGHT), TRUE[0].project(LON, LAT, HEIGHT))
@@ -220,17 +221,6 @@ def test_more_than_the_gcps_explain_is_doubted(images, points, tmp_path):
 
 
 @pytest.mark.slow
-def test_lidar_beside_its_place_is_doubted(images, tmp_path):
-    """What the disparities do not see: the common part is told by the slopes."""
-    cloud = lidar()
-    cloud[:, 0] += 2.0 / METRES[0]
-    store = write_points(tmp_path, cloud)
-    refined, _ = refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store])
-    assert len(refined.warnings) == 1 and "coordinate system" in refined.warnings[0]
-    assert abs(refined.refinement["lidar_height"]["offset_m"]) < 0.3
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("metres", "doubted"), [(0.4, False), (-30.0, True)])
 def test_heights_without_control_points_are_held_against_the_rpcs(
     images, tmp_path, metres, doubted
@@ -260,6 +250,17 @@ def test_heights_that_scatter_more_than_lidar_tell_of_other_ground(metres, told)
     along, across = rng.normal(0, 1, (2, 80)) * [[np.hypot(0.02, px_per_m * metres)], [0.02]]
     scatter, explained = scatter_by_heights(alignment, along, across)
     assert (scatter > explained) == told
+
+
+@pytest.mark.slow
+def test_lidar_beside_its_place_is_doubted(images, tmp_path):
+    """What the disparities do not see: the common part is told by the slopes."""
+    cloud = lidar()
+    cloud[:, 0] += 2.0 / METRES[0]
+    store = write_points(tmp_path, cloud)
+    refined, _ = refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store])
+    assert len(refined.warnings) == 1 and "coordinate system" in refined.warnings[0]
+    assert abs(refined.refinement["lidar_height"]["offset_m"]) < 0.3
 
 
 @pytest.mark.slow

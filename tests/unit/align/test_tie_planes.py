@@ -32,7 +32,7 @@ def points_of(cloud: np.ndarray, firm: np.ndarray | None = None) -> SitePoints:
     return SitePoints.sorted(*cloud.T.copy(), firm, (WIDE, WIDE), PARALLAX)
 
 
-@pytest.mark.parametrize("per_px", [0.11, 0.4, 2.0])
+@pytest.mark.parametrize("per_px", [0.11, 2.0])
 def test_a_third_of_crowns_does_not_tilt_a_plane(per_px):
     rng = np.random.default_rng(7)
     cloud = ground(rng, per_px)
@@ -44,14 +44,6 @@ def test_a_third_of_crowns_does_not_tilt_a_plane(per_px):
     assert planes[0, 1:3] == pytest.approx(SLOPES, abs=0.006)
     assert planes[0, 3] == pytest.approx(0.03, rel=0.5)
     assert share[0] == pytest.approx(inside.sum() / (inside.sum() + n), abs=0.06)
-
-
-def test_crowns_all_over_are_no_plane_to_match_on():
-    rng = np.random.default_rng(8)
-    at = rng.uniform(0, WIDE - 1, (9000, 2))
-    rough = np.column_stack([at, LEVEL + rng.uniform(0, 4, 9000)])
-    planes, _ = points_of(rough).fit_planes(CENTRE[None])
-    assert not planes[0, 3] < 0.5
 
 
 @pytest.mark.parametrize("number", range(len(GUARDS)))
