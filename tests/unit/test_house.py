@@ -35,8 +35,7 @@ FLOORS = (
     {"stereotruth.core"},
     {"stereotruth.sensor", "stereotruth.lidar", "stereotruth.pages", "stereocities"},
     {"stereotruth.epipolar"},
-    {"stereotruth.surface", "stereotruth.align"},
-    {"stereotruth.tiles", "stereobench.methods"},
+    {"stereotruth.surface", "stereotruth.align", "stereotruth.tiles", "stereobench.methods"},
     {"stereotruth.labels", "stereotruth.evaluate"}
     | {"stereobench.scores", "stereobench.networks", "stereobench.audit"},
     {"stereotruth.project"},  # asks all stages what they think of the input; nothing asks it

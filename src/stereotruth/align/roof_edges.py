@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
@@ -19,6 +18,7 @@ from ..core.numerics.degrees import metres_per_degree
 from ..core.numerics.robust import TO_SIGMA
 from ..sensor.image_reader import Source
 from ..sensor.rpc import SensorModel
+from .least_squares_matching import warp_patch
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -257,7 +257,7 @@ LINE_PX = 0.7  # px, of a line's place
 GRID_M = 0.2  # between the offsets that are tried
 ROUNDS = 30
 FEWEST_EDGES = 12  # edges with a line, of an image
-MARGIN_PX = 4
+MARGIN_PX = 6
 LARGEST_PX = 1500  # of a window that is read for the edges of a site
 WIDE_M = 10.0  # m, standard deviation of an offset in a direction that no edge tells
 
@@ -414,13 +414,10 @@ def _lines_across(
     their contrast [k]; none where the picture does not show all of it."""
     across = np.arange(-reach - 2.0, reach + 2.0 + STEP_PX, STEP_PX)
     count = max(int(np.hypot(*(end - start))), 4)
-    along = (np.arange(count) + 0.5) / count
-    base = start + (end - start) * along[:, None]
-    place = (base[:, None, :] + normal * across[:, None]).astype(np.float32)
-    grey = cv2.remap(
-        picture, place[..., 0], place[..., 1], cv2.INTER_CUBIC,
-        borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
-    )  # fmt: skip
+    grey = np.empty((count, across.size), np.float32)
+    step = np.column_stack([normal * STEP_PX, (end - start) / count])  # by column, by row
+    middle = start + step[:, 1] * (count // 2 + 0.5) + normal * across[across.size // 2]
+    warp_patch(picture, *middle, step, (1.0, 1.0), grey)
     if not np.isfinite(grey).all():
         return np.empty(0), np.empty(0)
     smooth = gaussian_filter1d(grey.astype(np.float64), BLUR_PX / STEP_PX, axis=1)
