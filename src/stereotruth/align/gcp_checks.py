@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError, in_number
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import rpc_file
+from ..sensor.shown_ground import GroundOfImages
 from .control_points import ControlPoints, TooFewPoints
 
 Bools = NDArray[np.bool_]
@@ -260,17 +261,10 @@ def _remedy(model: str, points: Floats) -> str:
 
 def footprint(sensor: SensorModel, size: tuple[int, int]) -> Floats:
     """(lon_min, lat_min, lon_max, lat_max) of an image over its RPC's heights, widened by half."""
-    heights = np.array([-1.0, 0.0, 1.0]) * abs(sensor.rpc.height_scale) + sensor.rpc.height_off
-    col, row, height = np.meshgrid([0, size[0] - 1], [0, size[1] - 1], heights)
-    lon, lat = sensor.localize(col, row, height)
-    if not np.isfinite(lon).any():
-        box = sensor.rpc.ground_box
-        low, high = np.array(box[:2]), np.array(box[2:4])
-    else:
-        low = np.array([np.nanmin(lon), np.nanmin(lat)])
-        high = np.array([np.nanmax(lon), np.nanmax(lat)])
-    margin = (high - low) / 2 + 0.01
-    return np.concatenate([low - margin, high + margin])
+    middle, half = sensor.rpc.height_off, abs(sensor.rpc.height_scale)
+    box = np.array(GroundOfImages([sensor], [size]).box((middle - half, middle + half)))
+    margin = (box[2:] - box[:2]) / 2 + 0.01
+    return box + np.concatenate([-margin, margin])
 
 
 def _in_box(box: Floats, lon: Floats, lat: Floats) -> Bools:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ..core.errors import InputError
 from ..core.products.files import atomic_file, read_record, sealed
@@ -18,7 +19,7 @@ from ..sensor.line_correction import LineCorrection, of_record, read_correction
 from ..sensor.rpc import RPC, SensorModel
 from .adjustment import read_equations, spread_of
 from .align import LARGE_SHIFT
-from .alignment import Alignment, GcpResidual, ViewFit, over_the_image
+from .alignment import Alignment, ViewFit, gcp_of, over_the_image
 from .control_points import NoPoints, read_gcps
 from .doubts import HEAVY, image_doubts
 from .plan_place import plan_slopes
@@ -30,9 +31,9 @@ from .site_fit import (
     PairToFit,
     PointsOfImage,
     SiteFit,
-    SiteLines,
     fit_site,
 )
+from .site_lines import SiteLines
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -69,12 +70,6 @@ def _points(rows: Mapping[tuple[Any, ...], None], rpc: RPC, size: tuple[int, int
     )
 
 
-def _px_per_m(rpc: RPC, size: tuple[int, int], height: float) -> Floats:
-    """By how much the middle of an image moves for a metre to the east, to the north [2, 2] px."""
-    lon, lat = rpc.localize((size[0] - 1) / 2, (size[1] - 1) / 2, height)
-    return plan_slopes(SensorModel(rpc), float(lon), float(lat), height)
-
-
 def _images(
     pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment], epoch: Epoch
 ) -> dict[str, ImageToFit]:
@@ -96,12 +91,12 @@ def _images(
             for k in np.flatnonzero(np.isfinite(at[:, 0])):
                 ground = float(points.lon[k]), float(points.lat[k]), float(points.height[k])
                 rows[name][(points.ids[k], *ground, *at[k].tolist())] = None
-    return {
-        name: ImageToFit(
-            name, fit, _points(rows[name], rpc, fit.size), _px_per_m(rpc, fit.size, height)
-        )
-        for name, (fit, rpc, height) in starts.items()
-    }
+    images = {}
+    for name, (fit, rpc, height) in starts.items():
+        lon, lat = map(float, rpc.localize(*((n - 1) / 2 for n in fit.size), height))
+        px_per_m = plan_slopes(SensorModel(rpc), lon, lat, height)
+        images[name] = ImageToFit(name, fit, _points(rows[name], rpc, fit.size), px_per_m)
+    return images
 
 
 def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
@@ -127,16 +122,15 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
             parameters[name] = np.array(values["images"][name]["parameters"])
             if (lines := read_correction(values["images"][name])) is not None:
                 by_line[name] = lines
-        order = values["covariance"]["images"]
-        index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
-        blocks.append(np.array(values["covariance"]["values"])[np.ix_(index, index)])
-    covariance = np.zeros((6 * len(parameters),) * 2)
-    start = 0
-    for block in blocks:
-        end = start + len(block)
-        covariance[start:end, start:end] = block
-        start = end
-    return FixedImages(parameters, covariance, by_line)
+        blocks.append(_covariance_of(values, names))
+    return FixedImages(parameters, block_diag(*blocks), by_line)
+
+
+def _covariance_of(site: Mapping[str, Any], names: Sequence[str]) -> Floats:
+    """[6 n, 6 n] px² of the parameters of some images of an adjusted site."""
+    order = site["covariance"]["images"]
+    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
+    return np.array(site["covariance"]["values"])[np.ix_(index, index)]
 
 
 def adjust_site(
@@ -227,23 +221,14 @@ def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
     }
 
 
-def _rms(lengths: Floats) -> float | None:
-    known = lengths[np.isfinite(lengths)]
-    return round(float(np.sqrt(np.mean(known**2))), 4) if len(known) else None
-
-
-def _nodes(fit: ViewFit) -> Floats:
-    """[81, 2, 6]: change of places all over an image with its parameters."""
-    axes = (np.linspace(0, n - 1, 9) for n in fit.size)
-    return fit.design(*(axis.ravel() for axis in np.meshgrid(*axes)))
-
-
 def _image_figures(
     image: ImageToFit, pairs: Sequence[PairToFit], fit: SiteFit, is_fixed: bool
 ) -> dict[str, Any]:
     name, points = image.name, image.points
     parameters, covariance = fit.parameters[name], fit.covariance_of(name)
-    nodes, used = _nodes(image.start), fit.used[name]
+    used = fit.used[name]
+    grid = np.meshgrid(*(np.linspace(0, n - 1, 9) for n in image.start.size))
+    nodes = image.start.design(*(axis.ravel() for axis in grid))  # places all over the image
     own = [pair for pair in pairs if name in (pair.left, pair.right)]
     fits = {pair.scene: fit.pairs[pair.scene] for pair in own if pair.scene in fit.pairs}
     residuals = [one.residuals[one.used] for one in fits.values() if one.weight > HEAVY]
@@ -254,6 +239,12 @@ def _image_figures(
         refused = f"neither tie points nor control points ({int(used.sum())}) place it: " + (
             "; ".join(reasons) or "its tie points contradict those of all other pairs"
         )
+
+    def rms(pairs: Floats) -> float | None:
+        lengths = np.hypot(*pairs[used].T)
+        known = lengths[np.isfinite(lengths)]
+        return round(float(np.sqrt(np.mean(known**2))), 4) if len(known) else None
+
     variance = np.einsum("nap,pq,naq->na", nodes, covariance, nodes)
     return {
         "file": image.start.image,
@@ -274,9 +265,9 @@ def _image_figures(
             "count": len(points.ids),
             "used": int(used.sum()),
             "left_out": [points.ids[k] for k in np.flatnonzero(~used)],
-            "before": _rms(np.hypot(*(points.measured - points.predicted)[used].T)),
-            "after": _rms(np.hypot(*fit.residuals[name][used].T)),
-            "leave_one_out": _rms(np.hypot(*fit.leave_one_out[name][used].T)),
+            "before": rms(points.measured - points.predicted),
+            "after": rms(fit.residuals[name]),
+            "leave_one_out": rms(fit.leave_one_out[name]),
             "points": _table(points, fit, name),
         },
         "ties": {
@@ -349,21 +340,18 @@ def write_site(values: Mapping[str, Any], path: str | Path) -> None:
 
 
 def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
-    """alignment.json of a pair by its images' adjusted corrections, JSON-ready.
+    """The record of :class:`.Alignment` of a pair by its images' adjusted corrections, JSON-ready.
 
-    ``site``: what :func:`.site_adjustment.adjust_site` found, or an earlier one that has both
-    images.
-    Of a pair whose image is refused it has the sentence ``refused`` alone, which
-    :meth:`.Alignment.read` raises.
+    ``site``: what :func:`adjust_site` found, or an earlier one that has both images. Of a pair
+    whose image is refused it has the sentence ``refused`` alone, which :meth:`.Alignment.read`
+    raises.
     """
     figures = [site["images"][name] for name in scene.names]
     for name, image in zip(scene.names, figures):
         if image["refused"]:
             return {"refused": f"scene {scene.scene}: image {name}: {image['refused']}"}
     base = Alignment.read(scene.alignment)
-    order = site["covariance"]["images"]
-    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in scene.names])
-    covariance = np.array(site["covariance"]["values"])[np.ix_(index, index)]
+    covariance = _covariance_of(site, scene.names)
     fits, sensors, warnings = [], [], list(base.warnings)
     for k, (name, image, fit, sensor) in enumerate(
         zip(scene.names, figures, base.fits, (base.left, base.right))
@@ -371,10 +359,7 @@ def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
         own = slice(6 * k, 6 * k + 6)
         start = rpc_alone(fit)
         affine = start.moved(np.array(image["parameters"]))
-        gcps = tuple(
-            GcpResidual(**{k: tuple(v) if isinstance(v, list) else v for k, v in row.items()})
-            for row in image["gcps"]["points"]
-        )
+        gcps = tuple(gcp_of(row) for row in image["gcps"]["points"])
         fits.append(
             replace(
                 start,
@@ -435,6 +420,3 @@ def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
         "the images, and y-parallax; before: by control points or RPCs, after: by the adjustment "
         "of all images of the site",
     }
-
-
-Bools = NDArray[np.bool_]

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from ..align.adjustment import PairEquations, estimate, read_equations
 from ..align.alignment import Alignment, over_the_image, parameters_of, rpc_prior
-from ..align.site_fit import SiteLines
+from ..align.site_lines import SiteLines
 from ..core.errors import InputError
 from ..core.numerics.bilinear import between_four
 from ..core.products.files import atomic_file, sealed
