@@ -31,12 +31,13 @@ from stereocities.site_images import (
     simulate_site_points,
 )
 from stereocities.sites import SiteSpec, drawn_site
-from stereotruth.align.adjustment import epipolar_model, write_equations
+from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align, from_rpcs
 from stereotruth.align.alignment import Alignment
 from stereotruth.align.images import open_view
+from stereotruth.align.records import ScenePair, pair_alignment, write_equations
 from stereotruth.align.refine import refine
-from stereotruth.align.site_adjustment import ScenePair, adjust_site, pair_alignment
+from stereotruth.align.site_adjustment import adjust_site
 from stereotruth.core.config.labels import LabelSettings
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import atomic_folder, write_table

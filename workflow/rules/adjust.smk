@@ -54,7 +54,7 @@ rule adjusted_alignment:
         sources=upstream("adjusted_alignment"),
         script=content_of("../scripts/adjusted_alignment.py"),
         images=lambda w: ADJUSTED[w.scene],
-        code=source_digest("stereotruth.align.site_adjustment"),
+        code=source_digest("stereotruth.align.records"),
     message:
         "Alignment of scene {wildcards.scene} by its adjusted images"
     script:

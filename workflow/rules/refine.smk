@@ -31,7 +31,7 @@ rule refine:
         strict=SETTINGS.strict,
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
         bands=SETTINGS.rectify.model_dump(),
-        code=source_digest("stereotruth.align.refine"),
+        code=source_digest("stereotruth.align.refine", "stereotruth.align.records"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
     script:

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from stereotruth.align.site_adjustment import ScenePair, adjust_site, write_site
+from stereotruth.align.records import ScenePair, write_site
+from stereotruth.align.site_adjustment import adjust_site
 from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 from stereotruth.core.products.provenance import checksums, describe, file_sha256

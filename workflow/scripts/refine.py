@@ -1,7 +1,7 @@
 """What is left between one scene's LiDAR and its two images, taken out of the alignment."""
 
-from stereotruth.align.adjustment import write_equations
 from stereotruth.align.alignment import Alignment
+from stereotruth.align.records import write_equations
 from stereotruth.align.refine import refine, write_refinement
 from stereotruth.core.config.labels import Rectify
 from stereotruth.core.job import job

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from ..core.numerics.robust import TUKEY, median_and_nmad, robust_sigma, tukey_weights
-from ..core.products.files import atomic_file, read_record, sealed
+from ..core.numerics.robust import TUKEY, robust_sigma, tukey_weights
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from .alignment import Alignment, over_the_image, parameters_of
+from .records import Equations, PairEquations
 from .tie_points import Geometry, TiePoints
 
 Bools = NDArray[np.bool_]
@@ -30,102 +27,6 @@ FREE = 1e-4  # share of the prior's weight that keeps a fit without it determine
 STARTS = 300  # planes, and shifts, from which the adjustment starts
 START_PX = 0.03  # px of an observation, besides its own, when blunders are looked for
 BLUNDER_ODDS = 1.0  # px²: of no blunder to a blunder in a square pixel
-MEANING = (
-    "observed [along, across the epipolar rows; px] = design [2, 12] @ parameters + error, one row "
-    "per tie point; parameters: (a_u, a_v, a_1, b_u, b_v, b_1) of the left image, then of the "
-    "right, of the correction of the RPC's (col, row) by (a_u u + a_v v + a_1, b_u u + b_v v + "
-    "b_1), px, (u, v) being px from the image's middle in halves of its longer side; own: px, "
-    "standard deviation of the match by itself; site: tie points of one part of the scene; at: "
-    "(col, row) px in the left image, there: in the right one; in_plan: of the left and the right "
-    "image, by edges of roofs: observed [col, row; px] = design [2, 6] @ parameters of the image + "
-    "error of this covariance [px^2], and px_per_m @ (east, north; m) of an error that all share"
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Equations:
-    """Observations [n] of what the corrections change: observed = design · parameters + errors.
-
-    ``design`` [n, 2, 12], ``observed`` [n, 2] px, along and across the rows. ``own`` [n] px: the
-    matches' own standard deviations, which count as ratios only (poor matches are poorer than that,
-    and biased where the surface is not what the points say). Observations of one ``site`` int[n]
-    share errors. ``at``, ``there`` [n, 2] px: place in the left and in the right image.
-    """
-
-    design: Floats
-    observed: Floats
-    own: Floats
-    site: NDArray[np.int64]
-    at: Floats
-    there: Floats
-
-    @property
-    def lines(self) -> Floats:
-        """[n, 2] px: lines of the left and of the right image."""
-        return np.column_stack([self.at[:, 1], self.there[:, 1]])
-
-    def part(self, chosen: Bools) -> Equations:
-        """Those that are ``chosen`` [n]."""
-        return Equations(*(getattr(self, f.name)[chosen] for f in fields(self)))
-
-    def about(self, parameters: Floats) -> Equations:
-        """The same of parameters that are counted from given ones [12]."""
-        return replace(self, observed=self.observed - self.design @ parameters)
-
-
-@dataclass(frozen=True, eq=False)
-class PlanObservation:
-    """The place of an image in plan, in px of (col, row): observed = design @ parameters + error.
-
-    ``design`` [2, 6] of the parameters of :func:`.adjustment.parameters_of`, ``observed`` [2],
-    ``covariance`` [2, 2] px² of the image's own error; ``px_per_m`` [2, 2]: by what a metre to the
-    east and to the north moves a place, and so the error that all images have in common.
-    """
-
-    design: Floats
-    observed: Floats
-    covariance: Floats
-    px_per_m: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class PairEquations:
-    """What the tie points of a pair say of its images, whatever alignment they were found with.
-
-    ``equations``: of the parameters [12] of :func:`.adjustment.parameters_of` of both images, left
-    first.
-    ``start`` [12]: those of the alignment by control points or RPCs; ``linearised_at`` [12]: those
-    with which the tie points were matched. ``places``: where the images were compared, with and
-    without a match. ``common_px``: see :func:`.adjustment.estimate`. ``in_plan``: the
-    place of the left and of the right image in plan, if edges of roofs tell it.
-    """
-
-    equations: Equations
-    start: Floats
-    linearised_at: Floats
-    places: int
-    common_px: float
-    in_plan: tuple[PlanObservation, ...] = ()
-
-
-def spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:
-    """Figures of one component [n] in px; the trend is that of a plane over the left image.
-
-    ``at`` [n, 2] px in the left image of ``size`` (cols, rows).
-    """
-    median, nmad = median_and_nmad(values)
-    middle, half = np.array(size) / 2, max(size) / 2
-    design = np.column_stack([(at - middle) / half, np.ones(len(values))])
-    plane = np.linalg.lstsq(design, values, rcond=None)[0]
-    figures = {
-        "median": median,
-        "nmad": nmad,
-        "rms": float(np.sqrt(np.mean(values**2))),
-        "trend_rms": float(np.sqrt(np.mean((design @ plane) ** 2))),
-        "trend_over_half_the_image_col": float(plane[0]),
-        "trend_over_half_the_image_row": float(plane[1]),
-    }
-    return {name: round(value, 4) for name, value in figures.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,41 +344,3 @@ def pull_of(design: Floats, observed: Floats, prior: Floats) -> Floats:
     inner = (design @ root).reshape(-1, root.shape[1])
     normal = np.eye(root.shape[1]) + inner.T @ inner / len(design)
     return root @ np.linalg.solve(normal, inner.T @ observed.ravel() / len(design))
-
-
-def write_equations(path: str | Path, ties: PairEquations | None, reason: str) -> None:
-    """Write the equations as JSON; without any, the ``reason`` why there are none."""
-    values: dict[str, Any] = {"what": "equations of tie points of a pair", "meaning": MEANING}
-    values["reason"] = reason if ties is None else ""
-    if ties is not None:
-        values |= {
-            "places": ties.places,
-            "common_px": ties.common_px,
-            "start": ties.start.tolist(),
-            "linearised_at": ties.linearised_at.tolist(),
-            **{name: array.tolist() for name, array in vars(ties.equations).items()},
-            "in_plan": [
-                {name: array.tolist() for name, array in vars(seen).items()}
-                for seen in ties.in_plan
-            ],
-        }
-    with atomic_file(path) as scratch:
-        scratch.write_text(re.sub(r"\n {2,}", " ", sealed(values)), encoding="utf-8")
-
-
-def read_equations(path: str | Path) -> tuple[PairEquations | None, str]:
-    """What :func:`write_equations` was given. Raises InputError if the file is damaged."""
-    return read_record(path, _from_dict, what="equations of tie points", stage="refine")
-
-
-def _from_dict(values: dict[str, Any]) -> tuple[PairEquations | None, str]:
-    if "design" not in values:
-        return None, values["reason"]
-    names = ("design", "observed", "own", "site", "at", "there")
-    equations = Equations(*(np.array(values[name]) for name in names))
-    about = (np.array(values[name]) for name in ("start", "linearised_at"))
-    in_plan = tuple(
-        PlanObservation(**{name: np.array(rows) for name, rows in seen.items()})
-        for seen in values["in_plan"]
-    )
-    return PairEquations(equations, *about, values["places"], values["common_px"], in_plan), ""

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
-from .adjustment import MATCHING, Equations, Estimate
+from .adjustment import MATCHING, Estimate
+from .records import Equations
 
 Floats = NDArray[np.float64]
 

@@ -29,12 +29,12 @@ from .adjustment import (
     LEAST_SIGMA,
     MATCHING,
     START_PX,
-    Equations,
     Estimate,
     estimate,
     root_of,
 )
 from .lack_of_fit import WIDEST, Steps, amount, climb
+from .records import Equations
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

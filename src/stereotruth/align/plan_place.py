@@ -14,8 +14,9 @@ from ..core.numerics.degrees import metres_per_degree
 from ..lidar.point_store import PointStore, query_points
 from ..sensor.image_reader import Source
 from ..sensor.rpc import SensorModel
-from .adjustment import Estimate, PlanObservation
+from .adjustment import Estimate
 from .alignment import Alignment, ViewFit, over_the_image, parameters_of
+from .records import PlanObservation
 from .roof_edges import ROOF_RIM_M, PlanOffset, RoofEdges, find_roof_edges, plan_offset
 from .tie_sites import IS_FIRM, choose_sites, query_box
 

@@ -35,7 +35,6 @@ from ..lidar.point_store import PointStore, open_stores
 from ..sensor.image_reader import Source, open_pair
 from .adjustment import (
     LEAST_SIGMA,
-    Equations,
     Estimate,
     Observations,
     agreement_of_halves,
@@ -43,7 +42,6 @@ from .adjustment import (
     linearised_at,
     pair_equations,
     pull_of,
-    spread_of,
 )
 from .align import PLACES_BY_RPCS
 from .alignment import Alignment, ViewFit, prior_of, with_corrections
@@ -66,6 +64,7 @@ from .lack_of_fit import SharedErrors, with_shared_errors
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
 from .plan_place import place_pair
+from .records import Equations, spread_of
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
 
@@ -243,6 +242,21 @@ def _search(
     return _Found(observations, found, shared, lines, current, halves, sigma)
 
 
+def _placed(
+    start: Alignment, result: _Found, sources: tuple[Source, Source], stores: Sequence[PointStore]
+) -> tuple[_Found, dict[str, Any]]:
+    """What tie points tell, with the place in plan, and the figures of it."""
+    found, figures, seen = place_pair(result.alignment, result.estimate, sources, stores)
+    of_images = replace(result.observations.of_images, in_plan=seen)
+    placed = replace(
+        result,
+        observations=replace(result.observations, of_images=of_images),
+        estimate=found,
+        alignment=with_corrections(start, found.parameters, result.lines.corrections),
+    )
+    return placed, figures
+
+
 def _discord(observations: Observations) -> str:
     """Why tie points tell nothing, or an empty string."""
     used = observations.used
@@ -348,14 +362,7 @@ def refine(
         alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)
         if not isinstance(result, str):
-            tied = result.alignment, result.estimate
-            found, in_plan, seen = place_pair(*tied, (left, right), stores)
-            observations = result.observations
-            observations = replace(
-                observations, of_images=replace(observations.of_images, in_plan=seen)
-            )
-            refined = with_corrections(alignment, found.parameters, result.lines.corrections)
-            result = replace(result, observations=observations, estimate=found, alignment=refined)
+            result, in_plan = _placed(alignment, result, (left, right), stores)
     record_of = dict(provenance or alignment.provenance)
     if isinstance(result, str):
         if not gcps and alone:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,15 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ..core.errors import InputError
-from ..core.products.files import atomic_file, read_record, sealed
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..sensor.line_correction import LineCorrection, of_record, read_correction
 from ..sensor.rpc import RPC, SensorModel
-from .adjustment import read_equations, spread_of
 from .align import LARGE_SHIFT
-from .alignment import Alignment, ViewFit, gcp_of, over_the_image
+from .alignment import Alignment, ViewFit
 from .control_points import NoPoints, read_gcps
 from .doubts import HEAVY, image_doubts
 from .plan_place import plan_slopes
+from .records import ScenePair, covariance_of, read_equations, read_site, rpc_alone
 from .site_fit import (
     LEAST_POINTS,
     FixedImages,
@@ -33,7 +31,6 @@ from .site_fit import (
     SiteFit,
     fit_site,
 )
-from .site_lines import SiteLines
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -122,15 +119,8 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
             parameters[name] = np.array(values["images"][name]["parameters"])
             if (lines := read_correction(values["images"][name])) is not None:
                 by_line[name] = lines
-        blocks.append(_covariance_of(values, names))
+        blocks.append(covariance_of(values, names))
     return FixedImages(parameters, block_diag(*blocks), by_line)
-
-
-def _covariance_of(site: Mapping[str, Any], names: Sequence[str]) -> Floats:
-    """[6 n, 6 n] px² of the parameters of some images of an adjusted site."""
-    order = site["covariance"]["images"]
-    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
-    return np.array(site["covariance"]["values"])[np.ix_(index, index)]
 
 
 def adjust_site(
@@ -300,123 +290,3 @@ def _table(points: PointsOfImage, fit: SiteFit, name: str) -> list[dict[str, Any
         }
         for k, (after, one_out, used) in enumerate(rows)
     ]
-
-
-@dataclass(frozen=True)
-class ScenePair:
-    """A scene and the names of its images, its refined alignment, equations and control points."""
-
-    scene: str
-    left: str
-    right: str
-    alignment: Path
-    equations: Path
-    gcps: Path | None = None
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """Of both images."""
-        return self.left, self.right
-
-
-def rpc_alone(fit: ViewFit) -> ViewFit:
-    """A fit that corrects nothing, with the parameters of the image alone."""
-    return over_the_image(replace(fit, affine=np.eye(2, 3), gcps=()))
-
-
-def read_site(path: str | Path) -> dict[str, Any]:
-    """What :func:`write_site` wrote. Raises InputError if it is damaged or something else."""
-
-    def checked(values: dict[str, Any]) -> dict[str, Any]:
-        return values | {name: values[name] for name in ("images", "pairs", "covariance")}
-
-    return read_record(path, checked, what="adjusted images", stage="adjust")
-
-
-def write_site(values: Mapping[str, Any], path: str | Path) -> None:
-    """Write what :func:`.site_adjustment.adjust_site` found, as JSON."""
-    with atomic_file(path) as scratch:
-        scratch.write_text(sealed(values), encoding="utf-8")
-
-
-def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
-    """The record of :class:`.Alignment` of a pair by its images' adjusted corrections, JSON-ready.
-
-    ``site``: what :func:`adjust_site` found, or an earlier one that has both images. Of a pair
-    whose image is refused it has the sentence ``refused`` alone, which :meth:`.Alignment.read`
-    raises.
-    """
-    figures = [site["images"][name] for name in scene.names]
-    for name, image in zip(scene.names, figures):
-        if image["refused"]:
-            return {"refused": f"scene {scene.scene}: image {name}: {image['refused']}"}
-    base = Alignment.read(scene.alignment)
-    covariance = _covariance_of(site, scene.names)
-    fits, sensors, warnings = [], [], list(base.warnings)
-    for k, (name, image, fit, sensor) in enumerate(
-        zip(scene.names, figures, base.fits, (base.left, base.right))
-    ):
-        own = slice(6 * k, 6 * k + 6)
-        start = rpc_alone(fit)
-        affine = start.moved(np.array(image["parameters"]))
-        gcps = tuple(gcp_of(row) for row in image["gcps"]["points"])
-        fits.append(
-            replace(
-                start,
-                affine=affine,
-                gcps=gcps,
-                sigma0=site["gcp_sigma_px"] if gcps else np.nan,
-                redundancy=2 * sum(g.used for g in gcps),
-                covariance=covariance[own, own],
-            )
-        )
-        sensors.append(SensorModel(sensor.rpc, affine, read_correction(image)))
-        warnings += [f"image {name}: {text}" for text in image["doubts"]]
-    of_pair = site["pairs"].get(scene.scene, {})
-    lines = of_pair.get("lines_covariance")
-    return replace(
-        base,
-        left=sensors[0],
-        right=sensors[1],
-        left_fit=fits[0],
-        right_fit=fits[1],
-        cross_covariance=covariance[:6, 6:],
-        lines_covariance=None if lines is None else np.array(lines),
-        shared_px=of_pair.get("shared_px", 0.0),
-        warnings=tuple(warnings),
-        refinement=_refinement(site, scene) | {"remark": base.refinement.get("remark", "")},
-    ).to_dict()
-
-
-def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
-    """The record of the refinement: the pair's tie points before and after the adjustment."""
-    record = {"applied": True, "reason": ""}
-    ties, reason = read_equations(scene.equations)
-    if ties is None:
-        return record | {"tie_points": 0, "without_own_tie_points": reason}
-    equations = ties.equations
-    used = site["pairs"].get(scene.scene, {}).get("used")  # none of a pair that came later
-    figures = [site["images"][name] for name in scene.names]
-    images = [np.array(of["parameters"]) for of in figures]
-    corrections = {k: one for k, of in enumerate(figures) if (one := read_correction(of))}
-    by_line = SiteLines(corrections, {}).effect(equations.design, equations.lines, (0, 1))
-    size = tuple(site["images"][scene.left]["size"])
-    spreads = {}
-    for word, parameters, lines in (
-        ("before", ties.start, 0.0),
-        ("after", np.concatenate(images), by_line),
-    ):
-        values = equations.observed - equations.design @ parameters - lines
-        spreads[word] = {
-            name: spread_of(values[:, k], equations.at, size)
-            for k, name in enumerate(("disparity", "y_parallax"))
-        }
-    return record | {
-        "tie_points": len(equations.own),
-        "used": used,
-        "sites": int(np.unique(equations.site).size),
-        **spreads,
-        "meaning": "px of the epipolar grid at the tie points: disparity of LiDAR minus that of "
-        "the images, and y-parallax; before: by control points or RPCs, after: by the adjustment "
-        "of all images of the site",
-    }

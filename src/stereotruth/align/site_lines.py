@@ -14,12 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sensor.line_correction import LineCorrection
-from .adjustment import (
-    FREE,
-    MATCHING,
-    Equations,
-    Estimate,
-)
+from .adjustment import FREE, MATCHING, Estimate
 from .line_fit import (
     LineFit,
     covariance_at_lines,
@@ -28,30 +23,9 @@ from .line_fit import (
     process,
     sums_of,
 )
+from .records import Equations, SiteLines
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class SiteLines:
-    """``corrections`` by number of the images that have one; ``covariance`` [k, 4, 4] px² by scene,
-    see :class:`.line_fit.LineFit`."""
-
-    corrections: Mapping[int, LineCorrection]
-    covariance: Mapping[str, Floats]
-
-    def effect(self, design: Floats, lines: Floats, images: tuple[int, int]) -> Floats | float:
-        """[n, 2] px: what the corrections of a pair's ``images`` change, along and across.
-
-        ``design`` [n, 2, 12] of the affines, ``lines`` [n, 2] px.
-        """
-        total: Floats | float = 0.0
-        for k, image in enumerate(images):
-            if image in self.corrections:
-                shift = self.corrections[image].at(lines[:, k])
-                for axis in (0, 1):
-                    total = total + design[:, :, 6 * k + 2 + 3 * axis] * shift[axis, :, None]
-        return total
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,9 +35,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ..align.adjustment import PairEquations, estimate, read_equations
+from ..align.adjustment import estimate
 from ..align.alignment import Alignment, over_the_image, parameters_of, rpc_prior
-from ..align.site_lines import SiteLines
+from ..align.records import PairEquations, SiteLines, read_equations
 from ..core.errors import InputError
 from ..core.numerics.bilinear import between_four
 from ..core.products.files import atomic_file, sealed

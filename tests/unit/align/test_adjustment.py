@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.align.adjustment import Equations, estimate
+from stereotruth.align.adjustment import estimate
+from stereotruth.align.records import Equations
 
 # ------------------------------------------------------------------------------- the estimate
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereocities.rpcs import draw_bias
-from stereotruth.align.adjustment import Equations, Estimate, estimate
+from stereotruth.align.adjustment import Estimate, estimate
 from stereotruth.align.align import align
 from stereotruth.align.alignment import GcpResidual
 from stereotruth.align.doubts import (
@@ -27,6 +27,7 @@ from stereotruth.align.doubts import (
     lines_of_sight,
     stand_out,
 )
+from stereotruth.align.records import Equations
 from stereotruth.align.refine import refine
 from stereotruth.lidar import geoid_candidates
 from stereotruth.lidar.ingest import ingest

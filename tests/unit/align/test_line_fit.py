@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereotruth.align.adjustment import Equations, estimate
+from stereotruth.align.adjustment import estimate
 from stereotruth.align.lack_of_fit import with_shared_errors
 from stereotruth.align.line_fit import LineFit, estimate_with_lines, line_design
+from stereotruth.align.records import Equations
 
 SIDE = 1100
 ROWS = (SIDE, SIDE)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.align.adjustment import PlanObservation, read_equations, write_equations
 from stereotruth.align.alignment import Alignment, rpc_prior
 from stereotruth.align.plan_place import COMMON_M, PlanFrame, plan_slopes, with_offsets
+from stereotruth.align.records import PlanObservation, read_equations, write_equations
 from stereotruth.align.refine import refine
 from stereotruth.align.roof_edges import RoofEdges, find_roof_edges, plan_offset
 from stereotruth.sensor.image_reader import open_pair

@@ -10,21 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.align.adjustment import (
-    Equations,
-    PairEquations,
-    parameters_of,
-    write_equations,
-)
+from stereotruth.align.adjustment import parameters_of
 from stereotruth.align.alignment import Alignment, ViewFit, over_the_image
 from stereotruth.align.control_points import LONG
-from stereotruth.align.site_adjustment import (
+from stereotruth.align.records import (
+    Equations,
+    PairEquations,
     ScenePair,
-    adjust_site,
     pair_alignment,
     read_site,
+    write_equations,
     write_site,
 )
+from stereotruth.align.site_adjustment import adjust_site
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import write_table
 

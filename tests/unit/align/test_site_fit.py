@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stereotruth.align.adjustment import Equations, PairEquations
 from stereotruth.align.alignment import ViewFit
+from stereotruth.align.records import Equations, PairEquations
 from stereotruth.align.site_fit import (
     FixedImages,
     ImageToFit,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import zarr
 
-from stereotruth.align.adjustment import write_equations
 from stereotruth.align.alignment import Alignment, ViewFit
+from stereotruth.align.records import write_equations
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.fit import fit_epipolar
