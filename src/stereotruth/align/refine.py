@@ -100,13 +100,10 @@ def _changes(fit: ViewFit, affine: Floats) -> dict[str, float]:
 
 
 def _record(
-    alignment: Alignment,
-    refined: Alignment,
-    observations: Observations,
-    found: Estimate,
-    reason: str,
+    alignment: Alignment, result: _Found, reason: str, offset: HeightOffset, in_plan: dict[str, Any]
 ) -> dict[str, Any]:
     """JSON-ready figures of a refinement; ``reason`` why it was not applied, or empty."""
+    observations, found, refined = result.observations, result.estimate, result.alignment
     used, ties = observations.used, observations.ties
     size = alignment.left_fit.size
     spreads = {
@@ -135,6 +132,15 @@ def _record(
         "of the images, and y-parallax; changes in px of the original images over the whole image; "
         "lidar_height: m, of LiDAR minus images, and from what on a fault is told; place_in_plan: "
         "m (east, north), see plan_place",
+        "by_line": result.lines.figures(),
+        "shared_by_near_sites": result.shared.figures(),
+        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
+        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
+        "place_in_plan": in_plan,
+        "lidar_height": {name: round(value, 3) for name, value in vars(offset).items()},
+        "misfit_of_one_half_by_the_other": {
+            word: round(misfit, 3) for word, misfit in zip(("before", "after"), result.halves)
+        },
     }
 
 
@@ -382,21 +388,11 @@ def refine(
         return unrefined, None
     observations, found, refined = result.observations, result.estimate, result.alignment
     reason = _objection(result, bool(gcps))
-    record = _record(alignment, refined, observations, found, reason)
-    record |= {
-        "by_line": result.lines.figures(),
-        "shared_by_near_sites": result.shared.figures(),
-        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
-        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
-    }
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
-    record["place_in_plan"] = in_plan
-    record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
+    record = _record(alignment, result, reason, offset, in_plan)
     covariance = found.covariance
-    misfits = [round(misfit, 3) for misfit in result.halves]
-    record["misfit_of_one_half_by_the_other"] = dict(zip(("before", "after"), misfits))
     if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
