@@ -1,4 +1,4 @@
-"""Doubts and remarks in words: about the LiDAR's heights, and why labels are less sure.
+"""Doubts and remarks in words: the LiDAR's heights, images of a site, why labels are less sure.
 
 A fault of the vertical datum (geoid left out or added twice, feet for metres, another zero) moves
 the LiDAR along the vertical, which the images see as a shift of both, each along its own line of

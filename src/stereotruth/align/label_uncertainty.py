@@ -14,6 +14,12 @@ The epipolar grids are made from the same corrections. So a ground point whose r
 gets wrong in the right image only keeps its left pixel and its disparity: its label is right, and
 the right image shows it in another row. That is y-parallax, an error of the images and not of the
 labels; e_y is that of the labelled view alone.
+
+Strips of the LiDAR that disagree are another error. A point that is off by o = (east, north, up)
+lies off in the grid of the labelled view, and its disparity is off, by e = J o. Images are aligned
+to all strips together, so that labels of a strip are off by e less what the alignment takes of it
+(:func:`_taken`). This is known of each strip; its square is part of the labels' variance, with the
+variance of the offset itself.
 """
 
 from __future__ import annotations

@@ -1,4 +1,11 @@
-"""The place of a pair in plan, by what its tie points tell and by edges of roofs in both images."""
+"""The place that all images of a pair or a site have in common in plan, and what is known of it.
+
+Tie points bind images to each other. Of the place that all have in common they tell by slopes only,
+and what they tell is stated with twice the variance that their scatter shows: light and shade
+change with the slope, and so do errors of matches, in all of a scene alike. Edges of roofs enter as
+observations beside them (:mod:`.roof_edges`). All images look at the same roofs, so that they share
+COMMON_M of error.
+"""
 
 from __future__ import annotations
 
