@@ -45,6 +45,7 @@ OF_MISFITS = {
     "shared_px": "px, standard deviation of disparity by errors that near tie points share and no "
     "correction fits",
 }
+PAIRS = ("measured", "predicted", "before", "after", "leave_one_out")  # of a GcpResidual
 
 
 @dataclass(frozen=True)
@@ -185,6 +186,14 @@ class Alignment:
         """Left and right."""
         return self.left_fit, self.right_fit
 
+    @property
+    def middle(self) -> tuple[float, float, float]:
+        """(lon, lat, height) of what the middle of the left image shows, degrees and m."""
+        cols, rows = self.left_fit.size
+        height = self.reference_height
+        lon, lat = self.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+        return float(lon), float(lat), height
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready; what is undetermined is null."""
         sensors = self.left, self.right
@@ -312,9 +321,6 @@ def with_corrections(
         left_fit=fits[0],
         right_fit=fits[1],
     )
-
-
-PAIRS = ("measured", "predicted", "before", "after", "leave_one_out")  # of a GcpResidual
 
 
 def _finite(value: float) -> float | None:

@@ -28,6 +28,7 @@ from .align import CAREFUL_SIGMA
 from .alignment import Alignment, GcpResidual
 from .lack_of_fit import SharedErrors
 from .line_fit import LineFit
+from .plan_place import plan_slopes
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -189,9 +190,7 @@ def lines_of_sight(alignment: Alignment) -> Floats:
 
     In the left and the right image, (col, row).
     """
-    cols, rows = alignment.left_fit.size
-    height = alignment.reference_height
-    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+    lon, lat, height = alignment.middle
     moved = []
     for sensor in (alignment.left, alignment.right):
         ends = [np.array(sensor.project(lon, lat, height + z)) for z in (-5.0, 5.0)]
@@ -235,21 +234,10 @@ def chance_of_contradiction(alignment: Alignment, found: Estimate) -> float:
 
     ``alignment`` as it came. A LiDAR that is off in plan moves both images alike.
     """
-    cols, rows = alignment.left_fit.size
-    height = alignment.reference_height
-    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
-    step = LIDAR_PLAN_M / metres_per_degree(float(lat))
-    moved = []
-    for east, north in ((step[0], 0.0), (0.0, step[1])):
-        ends = [
-            np.stack([
-                np.array(sensor.project(lon + sign * east, lat + sign * north, height))
-                for sensor in (alignment.left, alignment.right)
-            ])
-            for sign in (-0.5, 0.5)
-        ]  # fmt: skip
-        moved.append(np.linalg.pinv(found.root) @ _constants(ends[1] - ends[0]))
-    plan = np.stack(moved, axis=1)
+    sensors = alignment.left, alignment.right
+    slopes = np.stack([plan_slopes(sensor, *alignment.middle) for sensor in sensors])
+    moved = [_constants(LIDAR_PLAN_M * slopes[:, :, k]) for k in (0, 1)]
+    plan = np.linalg.pinv(found.root) @ np.stack(moved, axis=1)
     values, vectors = np.linalg.eigh(found.normal)
     seen = values > 1e-9 * values.max()
     alone = vectors[:, seen].T @ np.linalg.pinv(found.root) @ found.alone

@@ -37,6 +37,15 @@ RAYLEIGH_MEDIAN = 1.1774  # median length of a 2-D Gaussian vector of unit sigma
 PRIOR_NOISE = 0.5  # px of a measurement, and
 PRIOR_TILT = (1.0, 0.0005)  # px plus share of the extent that RPCs may be tilted: for ties only
 MAX_SAMPLES = 2000  # minimal samples tried: all of them up to 23 GCPs
+# One more than determines the model is asked for: with fewer, no residual tells of an error.
+NEEDED = {model: n + 1 for model, n in MINIMAL.items()}
+MAX_LEFT_OUT = 1 / 3  # share of blunders beyond which nobody knows which points are right
+MAX_SIGMA = 5.0  # px: beyond, GCPs and image do not belong together
+UNCHECKED_SIGMA = 3.0  # px, where there are too few GCPs to find the blunder among them
+MAX_TILT = 0.05  # beyond, columns and rows are mixed up
+MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
+MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
+FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,17 +199,6 @@ def leave_one_out_residuals(system: System, used: Bools) -> Floats:
         determined = np.linalg.eigvalsh(left[i])[0] > 1e-9
         out[i] = np.linalg.solve(left[i], residuals[i]) if determined else np.nan
     return out
-
-
-# One more than determines the model is asked for: with fewer, no residual tells of an error.
-NEEDED = {model: n + 1 for model, n in MINIMAL.items()}
-MAX_LEFT_OUT = 1 / 3  # share of blunders beyond which nobody knows which points are right
-MAX_SIGMA = 5.0  # px: beyond, GCPs and image do not belong together
-UNCHECKED_SIGMA = 3.0  # px, where there are too few GCPs to find the blunder among them
-MAX_TILT = 0.05  # beyond, columns and rows are mixed up
-MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
-MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
-FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ from ..sensor.acquisition import Acquisition, by_sheet, read_acquisition
 from ..sensor.pair_geometry import find_overlap, find_rotation
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import read_rpc, rpc_file
+from ..sensor.shown_ground import GroundOfImages
 from ..sensor.site_pairs import SiteImage
 from ..sensor.virtual_points import frame, steps
 from .alignment import RPC_SHIFT, RPC_TILT
@@ -182,7 +183,8 @@ def footprint_of(
     what is wrong.
     """
     try:
-        outlines = [o for left, right in pairs for o in pair_outlines(*opened(left, right))]
+        opened = [GroundOfImages.open(images) for images in pairs]
+        outlines = [o for pair in opened for o in pair_outlines(*pair.sensors, tuple(pair.sizes))]
     except (InputError, RasterioError, OSError, ValueError):
         return None
     every = np.hstack(outlines)
@@ -190,18 +192,6 @@ def footprint_of(
     if not (np.isfinite(every).all() and small and np.abs(every[0]).max() < FARTHEST_LON):
         return None
     return Footprint.around(outlines, margin_m)
-
-
-def opened(
-    left_image: str | Path, right_image: str | Path
-) -> tuple[SensorModel, SensorModel, Sizes]:
-    """Sensor models and sizes (cols, rows) of both images. Raises what reading them raises."""
-    sensors, sizes = [], []
-    for image in (left_image, right_image):
-        sensors.append(SensorModel(read_rpc(image)))
-        with open_raster(image) as dataset:
-            sizes.append((dataset.width, dataset.height))
-    return sensors[0], sensors[1], (sizes[0], sizes[1])
 
 
 def pair_outlines(left: SensorModel, right: SensorModel, sizes: Sizes) -> list[Floats]:

@@ -44,6 +44,8 @@ Floats = NDArray[np.float64]
 
 STEP = 64  # px between the nodes; variances are quadratic in between, and at most too large there
 _UPPER = np.triu_indices(3)  # (d, d), (d, x), (d, y), (x, x), (x, y), (y, y)
+SQUARE_DEG = (1 << CELL_BITS) * LATTICE_DEG / SQUARES
+MOVE_M = 10.0  # over which J is a difference
 
 
 def label_covariance(
@@ -197,10 +199,6 @@ def _variance(nodes: Floats, v: Floats, u: Floats, slope: Floats, out: Floats) -
                 f,
             )
             out[y, x] = max(variance, 0.0)  # nodes are rounded
-
-
-SQUARE_DEG = (1 << CELL_BITS) * LATTICE_DEG / SQUARES
-MOVE_M = 10.0  # over which J is a difference
 
 
 def with_strips(

@@ -33,6 +33,11 @@ Floats = NDArray[np.float64]
 COMMON_M = 0.25  # m, standard deviation of what all images see alike of roofs' edges: half a rim
 OWN_M = 0.1  # m: of what each sees by itself, besides the scatter of its edges
 SLOPES_SHARE = 1.0  # variance that matches on slopes share, by that which their scatter shows
+log = logging.getLogger("stereotruth")
+WORTH = 0.5  # of COMMON_M: a place that is known better gains nothing by edges
+REACH_SIGMAS, LEAST_REACH_M, LARGEST_REACH_M = 3.0, 4.0, 8.0  # of the search for an offset
+EDGES = 240  # about, of a scene
+AGREE_SIGMAS = 3.0  # of images and halves, that the offsets of either may lie apart
 
 
 def plan_slopes(sensor: SensorModel, lon: float, lat: float, height: float) -> Floats:
@@ -106,15 +111,6 @@ def with_offsets(
     return moved, (covariance + covariance.T) / 2.0
 
 
-log = logging.getLogger("stereotruth")
-
-
-WORTH = 0.5  # of COMMON_M: a place that is known better gains nothing by edges
-REACH_SIGMAS, LEAST_REACH_M, LARGEST_REACH_M = 3.0, 4.0, 8.0  # of the search for an offset
-EDGES = 240  # about, of a scene
-AGREE_SIGMAS = 3.0  # of images and halves, that the offsets of either may lie apart
-
-
 def place_pair(
     refined: Alignment,
     found: Estimate,
@@ -125,11 +121,8 @@ def place_pair(
 
     ``found`` and ``refined``: of the tie points.
     """
-    height = refined.reference_height
-    cols, rows = refined.left_fit.size
-    lon, lat = (float(v) for v in refined.left.localize((cols - 1) / 2, (rows - 1) / 2, height))
     sensors = refined.left, refined.right
-    frame = PlanFrame.of(refined.fits, [plan_slopes(s, lon, lat, height) for s in sensors])
+    frame = PlanFrame.of(refined.fits, [plan_slopes(s, *refined.middle) for s in sensors])
     to_parameters = found.root @ np.linalg.inv(np.eye(len(found.normal)) + found.normal)
     of_ties = found.covariance - to_parameters @ to_parameters.T
     covariance = frame.widened(found.covariance, of_ties)

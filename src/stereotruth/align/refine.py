@@ -83,6 +83,10 @@ MIN_PLACES, MIN_SITES = 30, 8
 LOOSE = 0.5  # px: tie points that scatter more, or half of them blunders, tell nothing
 DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, that is worth a word
 SIGNIFICANT = 0.001  # probability of the change by chance, if the alignment were right
+HEIGHTS_BY_RPCS = (
+    "without ground control points a fault of the LiDAR's heights of less than {:.0f} m cannot be "
+    "told from errors of the RPCs"
+)
 
 
 def _changes(fit: ViewFit, affine: Floats) -> dict[str, float]:
@@ -156,12 +160,6 @@ class _Found:
     alignment: Alignment
     halves: tuple[float, float]
     sigma: LabelSigma
-
-
-HEIGHTS_BY_RPCS = (
-    "without ground control points a fault of the LiDAR's heights of less than {:.0f} m cannot be "
-    "told from errors of the RPCs"
-)
 
 
 def _search(

@@ -45,6 +45,19 @@ BESIDE = 4.5  # cells around a step where no other line is looked for
 FEWEST = 6  # steps, and points of each side
 TURNS = np.radians(np.arange(-6.0, 6.5, 1.0))  # of a line, that are tried
 EMPTY_CELLS = 3.0  # cells from the nearest point on: nothing is known there
+ROOF_RIM_M = 0.5  # m: lines of one edge lie within, as both sides of a parapet do
+INWARD_M = 0.3  # m, standard deviation of how far points lie inwards of a roof's edge
+STEP_PX = 0.5  # of a profile across an edge
+BLUR_PX = 1.0  # standard deviation, before slopes are taken
+LINE_SIGMAS = 6.0  # of the slopes' scatter along an edge, that those of a line stand out
+LINE_PX = 0.7  # px, of a line's place
+GRID_M = 0.2  # between the offsets that are tried
+ROUNDS = 30
+FEWEST_EDGES = 12  # edges with a line, of an image
+MARGIN_PX = 6
+LARGEST_PX = 1500  # of a window that is read for the edges of a site
+WIDE_M = 10.0  # m, standard deviation of an offset in a direction that no edge tells
+BESIDE_EDGES = np.array([WIDE_M, WIDE_M, INWARD_M]) ** -2.0  # information, m⁻²
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,20 +267,6 @@ def _parting(u: Floats, v: Floats, high: Bools) -> tuple[float, float, int]:
     return best[1], best[2], best[0][0]
 
 
-ROOF_RIM_M = 0.5  # m: lines of one edge lie within, as both sides of a parapet do
-INWARD_M = 0.3  # m, standard deviation of how far points lie inwards of a roof's edge
-STEP_PX = 0.5  # of a profile across an edge
-BLUR_PX = 1.0  # standard deviation, before slopes are taken
-LINE_SIGMAS = 6.0  # of the slopes' scatter along an edge, that those of a line stand out
-LINE_PX = 0.7  # px, of a line's place
-GRID_M = 0.2  # between the offsets that are tried
-ROUNDS = 30
-FEWEST_EDGES = 12  # edges with a line, of an image
-MARGIN_PX = 6
-LARGEST_PX = 1500  # of a window that is read for the edges of a site
-WIDE_M = 10.0  # m, standard deviation of an offset in a direction that no edge tells
-
-
 @dataclass(frozen=True, eq=False)
 class PlanOffset:
     """``offset`` [2] m (east, north) by which all edges lie off in an image, what it shows minus
@@ -341,7 +340,7 @@ def plan_offset(
     halves = np.array([_estimate(lines, change, half, reach_m)[0][:2] for half in (odd, ~odd)])
     total = np.stack([np.bincount(groups, score) for score in scores.T])
     inverse = np.linalg.inv(normal)
-    covariance = (inverse @ (total @ total.T + np.diag(_prior())) @ inverse)[:2, :2]
+    covariance = (inverse @ (total @ total.T + np.diag(BESIDE_EDGES)) @ inverse)[:2, :2]
     apart = halves[0] - halves[1]  # parapets of one side of all roofs, say, have no scatter
     used = np.unique(lines.edge)
     middle = np.column_stack([edges.middle, edges.height])[used].mean(axis=0)
@@ -353,11 +352,6 @@ def plan_offset(
         middle,
         used.size,
     )
-
-
-def _prior() -> Floats:
-    """Information [3] that stands beside the edges, m⁻²."""
-    return np.array([WIDE_M, WIDE_M, INWARD_M]) ** -2.0
 
 
 def _estimate(
@@ -380,7 +374,7 @@ def _estimate(
     for _ in range(ROUNDS):
         residual = lines.offset - change @ estimate
         weight = share * np.exp(-0.5 * (residual / width) ** 2) / width**2
-        normal = (change * weight[:, None]).T @ change + np.diag(_prior())
+        normal = (change * weight[:, None]).T @ change + np.diag(BESIDE_EDGES)
         last = estimate
         estimate = np.linalg.solve(normal, change.T @ (weight * lines.offset))
         if np.abs(estimate - last).max() < 1e-5:

@@ -43,6 +43,13 @@ from .plan_place import PlanFrame, with_offsets
 from .records import Equations, PairEquations, PlanObservation, SiteLines
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+STEPS = 60  # of the reweighting, at most
+SETTLED_PX = 1e-6  # change of a step after which no other follows
+FIRST_STEPS = 12  # with weights that leave nothing out: the start is not robust
+SEEN = 1e-6  # share of the largest eigenvalue from which on a pair tells a direction
+LEAST_POINTS = 2  # control points that determine an image's place without tie points, and check it
+OTHERS = 3  # observations of a kind from which on their scatter tells a blunder
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,17 +144,6 @@ def _of_pair(
         np.concatenate(design, axis=-1) * scale[:, None, None],
         observed * scale[:, None],
     )
-
-
-Bools = NDArray[np.bool_]
-
-
-STEPS = 60  # of the reweighting, at most
-SETTLED_PX = 1e-6  # change of a step after which no other follows
-FIRST_STEPS = 12  # with weights that leave nothing out: the start is not robust
-SEEN = 1e-6  # share of the largest eigenvalue from which on a pair tells a direction
-LEAST_POINTS = 2  # control points that determine an image's place without tie points, and check it
-OTHERS = 3  # observations of a kind from which on their scatter tells a blunder
 
 
 @dataclass(frozen=True, eq=False)

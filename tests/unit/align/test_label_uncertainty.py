@@ -131,23 +131,6 @@ def test_between_nodes_it_is_a_covariance_and_at_most_a_little_too_large(alignme
     assert uncertainty.step == STEP
 
 
-def test_without_ground_the_worst_place_counts(alignment, model, monkeypatch):
-    exact = LabelUncertainty.of(alignment, model).nodes
-
-    def holed(*args):
-        found = label_covariance(*args)
-        found[0, 0] = np.nan
-        return found
-
-    monkeypatch.setattr("stereotruth.align.label_uncertainty.label_covariance", holed)
-    nodes = LabelUncertainty.of(alignment, model).nodes
-    assert np.array_equal(nodes[:, 1:], exact[:, 1:])
-    total = exact[[0, 3, 5]].sum(axis=0)
-    total[0, 0] = 0.0
-    at = np.unravel_index(total.argmax(), total.shape)
-    assert np.array_equal(nodes[:, 0, 0], exact[:, *at])
-
-
 # ------------------------------------------------------------ strips of the LiDAR that disagree
 
 OFFSET = np.array([0.3, -0.2, 0.12])

@@ -11,7 +11,6 @@ import pytest
 from stereotruth.align.alignment import ViewFit
 from stereotruth.align.records import Equations, PairEquations
 from stereotruth.align.site_fit import (
-    FixedImages,
     ImageToFit,
     PairToFit,
     PointsOfImage,
@@ -76,8 +75,8 @@ class Made:
         design = view(name).design(*(axis.ravel() for axis in grid))
         return design @ (fit.parameters[name] - self.truth[name])
 
-    def fit(self, fixed: FixedImages | None = None) -> SiteFit:
-        return fit_site(list(self.images.values()), self.pairs, fixed)
+    def fit(self) -> SiteFit:
+        return fit_site(list(self.images.values()), self.pairs)
 
 
 def rms(values: np.ndarray) -> float:
@@ -142,23 +141,6 @@ def test_wrong_control_points_are_left_out():
     assert rms(made.errors(fit, "C")) < rms(made.errors(clean, "C")) + 0.05
     # what the point is off, by the adjustment without it
     assert fit.leave_one_out["C"][3] == pytest.approx([8.0, -5.0], abs=0.8)
-
-
-def test_fixed_images_stay_and_lend_their_uncertainty():
-    """A later image is added: the others keep their corrections, to the bit."""
-    made = Made(7)
-    every = made.pairs
-    of_four = [pair for pair in every if "E" not in (pair.left, pair.right)]
-    four = [image for name, image in made.images.items() if name != "E"]
-    first = fit_site(four, of_four)
-    fixed = FixedImages(first.parameters, first.covariance)
-    later = made.fit(fixed)
-    for name in NAMES[:4]:
-        assert (later.parameters[name] == first.parameters[name]).all()
-        assert later.covariance_of(name) == pytest.approx(first.covariance_of(name), abs=1e-11)
-    assert rms(made.errors(later, "E")) < 0.15
-    own = later.covariance_of("E")
-    assert own[2, 2] > 0.5 * first.covariance_of("A")[2, 2]
 
 
 def test_an_image_that_jitters_is_corrected_by_line():

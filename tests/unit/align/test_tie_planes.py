@@ -76,15 +76,3 @@ def test_a_pulse_of_several_returns_and_a_hole_are_left_out():
     assert not clear[np.hypot(col - 5, row - 5) < 2.5].any()
     assert not clear[np.hypot(col + 6, row + 6) < 2.0].any()
     assert clear[row > 8].mean() > 0.9 and clear[col > 9].mean() > 0.9
-
-
-def test_points_in_any_order_give_the_same_plane_and_pixels():
-    rng = np.random.default_rng(11)
-    cloud = np.vstack([ground(rng, 1.0), crown(rng, (64.0, 57.0), 4.0, 30)])
-    planes, clear = [], []
-    for order in (np.arange(len(cloud)), rng.permutation(len(cloud))):
-        points = points_of(cloud[order])
-        planes.append(points.fit_planes(CENTRE[None])[0][0])
-        clear.append(points.clear_pixels(CENTRE[None], planes[-1:])[0, 0])
-    assert (planes[0] == planes[1]).all()
-    assert (clear[0] == clear[1]).all()
