@@ -89,11 +89,11 @@ class _Trial:
         """Rows of the table that are left out."""
         return set(self.view.index[~self.used].tolist())
 
-    def fit(self, model: str, points: ControlPoints, out_in_other: set[int], of: str) -> ViewFit:
+    def fit(self, model: str, points: ControlPoints, out_in_other: set[int]) -> ViewFit:
         """The exact fit to what is used; InputError if that is too little, or does not fit."""
         view, system, used = self.view, self.system, self.used
-        refuse_fit(model, view, points, used, of)
-        sigma = refuse_misfit(model, view, system, points, used, of)
+        refuse_fit(model, view, points, used)
+        sigma = refuse_misfit(model, view, system, points, used)
         parameters = system.solve(used)
         after = system.residuals(parameters)
         one_out = leave_one_out_residuals(system, used)
@@ -189,33 +189,11 @@ def align(
     points = read_gcps(gcps_csv, scene, names, epoch)
     opened = [open_view(n, image, of) for n, image in zip(("left", "right"), images)]
     sensors = opened[0][0], opened[1][0]
-    near = check_ground(points, [footprint(*item) for item in opened], images, of)
-    check_swapped(points, sensors, near, of)
-
-    doubts = list(points.remarks)
-    doubts += [text for text in {check_heights(points, sensor): None for sensor in sensors} if text]
-    for name, ok in zip(points.ids, near):
-        if not ok:
-            doubts.append(f"GCP {name} left out, its ground coordinates are far from the images")
-
-    trials = []
-    for name, image, (sensor, size), measured in zip(
-        ("left", "right"), images, opened, (points.left, points.right)
-    ):
-        seen = np.isfinite(measured[:, 0])
-        projected = np.stack(sensor.project(points.lon, points.lat, points.height), axis=1)
-        index = np.flatnonzero(seen & near & np.isfinite(projected).all(axis=1))
-        view = View(name, image, size, sensor, index, projected[index], measured[index])
-        check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]), of)
-        refuse_fit(model, view, points, np.ones(len(index), dtype=bool), of)
-        system = System.of(model, view.predicted, view.measured)
-        trials.append(_Trial(view, system, *find_blunders(system, floor=BLUNDER_FLOOR, seed=seed)))
-    if points.frame and points.frame["source"]["legs"]:
-        legs = "; ".join(points.frame["source"]["legs"])
-        log.info("GCPs of frame %s brought to ITRF2020: %s", points.frame["source"]["frame"], legs)
-    _leave_out_of_both(trials)
-    out = [trial.left_out for trial in trials]
-    fits = [trial.fit(model, points, other, of) for trial, other in zip(trials, reversed(out))]
+    try:
+        fits, doubts = _fit_views(points, images, opened, model, seed)
+    except InputError as error:
+        file = error.file or points.file
+        raise type(error)(error.problem + of, file=file, remedy=error.remedy) from None
     for fit in fits:
         doubts += _doubts(fit, model)
     _tell(fits, model, doubts)
@@ -242,6 +220,47 @@ def align(
         warnings=tuple(doubts),
         provenance=dict(provenance),
     )
+
+
+def _fit_views(
+    points: ControlPoints,
+    images: tuple[Path, Path],
+    opened: Sequence[tuple[SensorModel, tuple[int, int]]],
+    model: str,
+    seed: int,
+) -> tuple[list[ViewFit], list[str]]:
+    """The fits of both views, and doubts about the points. What is refused does not name the scene
+    yet."""
+    near = check_ground(points, [footprint(*item) for item in opened], images)
+    check_swapped(points, [sensor for sensor, _ in opened], near)
+
+    doubts = list(points.remarks)
+    doubts += [
+        text for text in {check_heights(points, sensor): None for sensor, _ in opened} if text
+    ]
+    for name, ok in zip(points.ids, near):
+        if not ok:
+            doubts.append(f"GCP {name} left out, its ground coordinates are far from the images")
+
+    trials = []
+    for name, image, (sensor, size), measured in zip(
+        ("left", "right"), images, opened, (points.left, points.right)
+    ):
+        seen = np.isfinite(measured[:, 0])
+        projected = np.stack(sensor.project(points.lon, points.lat, points.height), axis=1)
+        index = np.flatnonzero(seen & near & np.isfinite(projected).all(axis=1))
+        view = View(name, image, size, sensor, index, projected[index], measured[index])
+        check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]))
+        refuse_fit(model, view, points, np.ones(len(index), dtype=bool))
+        system = System.of(model, view.predicted, view.measured)
+        trials.append(_Trial(view, system, *find_blunders(system, floor=BLUNDER_FLOOR, seed=seed)))
+    if points.frame and points.frame["source"]["legs"]:
+        legs = "; ".join(points.frame["source"]["legs"])
+        log.info("GCPs of frame %s brought to ITRF2020: %s", points.frame["source"]["frame"], legs)
+    _leave_out_of_both(trials)
+    out = [trial.left_out for trial in trials]
+    fits = [trial.fit(model, points, other) for trial, other in zip(trials, reversed(out))]
+    return fits, doubts
 
 
 def _leave_out_of_both(trials: Sequence[_Trial]) -> None:

@@ -5,7 +5,7 @@ found by least trimmed squares over all minimal samples (Rousseeuw & Van Driesse
 LTS regression for large data sets"), then by studentised residuals; the result is the exact
 least-squares solution (by ``cv2.solve``) on the other points. ``cv2.estimateAffine2D``, the paper's
 way, draws random samples and refines its result only in part, so that it depends on the order of
-the points. What is refused names file and remedy.
+the points. What is refused names the remedy, and the file if it is not that of the points.
 """
 
 from __future__ import annotations
@@ -271,9 +271,7 @@ def _in_box(box: Floats, lon: Floats, lat: Floats) -> Bools:
     return (lon >= box[0]) & (lon <= box[2]) & (lat >= box[1]) & (lat <= box[3])
 
 
-def check_ground(
-    points: ControlPoints, boxes: Sequence[Floats], images: Sequence[Path], of: str
-) -> Bools:
+def check_ground(points: ControlPoints, boxes: Sequence[Floats], images: Sequence[Path]) -> Bools:
     """bool[n]: near either image's footprint (``boxes``, left and right).
 
     Refuses the file if most points are elsewhere, an RPC if it is alone with its ground.
@@ -289,7 +287,7 @@ def check_ground(
         box = boxes[wrong]
         raise InputError(
             f"this RPC leads to ground about lon {(box[0] + box[2]) / 2:.4f}, lat "
-            f"{(box[1] + box[3]) / 2:.4f}; the other image and the GCPs are elsewhere{of}",
+            f"{(box[1] + box[3]) / 2:.4f}; the other image and the GCPs are elsewhere",
             file=rpc_file(images[wrong]),
             remedy="check that RPC and image belong together, and the image to this scene",
         )
@@ -304,13 +302,11 @@ def check_ground(
     )
     if 2 * swapped.sum() > len(near):
         raise InputError(
-            f"lon and lat of the GCPs seem to be swapped: {where}{of}",
-            file=points.file,
+            f"lon and lat of the GCPs seem to be swapped: {where}",
             remedy="exchange the columns lon and lat",
         )
     raise InputError(
-        f"the GCPs lie far from the ground that the images show: {where}{of}",
-        file=points.file,
+        f"the GCPs lie far from the ground that the images show: {where}",
         remedy="check that the file is that of this scene, and its coordinates WGS 84 degrees",
     )
 
@@ -330,7 +326,7 @@ def check_heights(points: ControlPoints, sensor: SensorModel) -> str:
 
 
 def misfits_of_sides(
-    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools | None = None
+    points: ControlPoints, sensors: Sequence[SensorModel], near: Bools | None = None
 ) -> tuple[float, float]:
     """How far GCPs miss a pair as it is given, and with both images exchanged, px.
 
@@ -360,22 +356,19 @@ def fit_exchanged(given: float, exchanged: float) -> bool:
     return given > 10.0 and exchanged < given / 5
 
 
-def check_swapped(
-    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools, of: str
-) -> None:
+def check_swapped(points: ControlPoints, sensors: Sequence[SensorModel], near: Bools) -> None:
     """Refuse a pair whose GCPs fit only with left and right exchanged."""
     given, exchanged = misfits_of_sides(points, sensors, near)
     if fit_exchanged(given, exchanged):
         raise InputError(
             "left_image and right_image seem to be swapped in the scenes sheet: the GCPs miss by "
-            f"{given:.0f} px as given, by {exchanged:.1f} px with the two exchanged{of}",
-            file=points.file,
+            f"{given:.0f} px as given, by {exchanged:.1f} px with the two exchanged",
             remedy="exchange the columns left_image and right_image of this scene; left is the "
             "backward view (or exchange the left and right columns of the GCP file, if it is that)",
         )
 
 
-def check_frame(points: ControlPoints, view: View, of: str) -> None:
+def check_frame(points: ControlPoints, view: View) -> None:
     """Refuse measurements outside the image."""
     limit = np.array(view.size) - 0.5 + FRAME_MARGIN
     outside = ~((view.measured >= -0.5 - FRAME_MARGIN) & (view.measured <= limit)).all(axis=1)
@@ -387,8 +380,7 @@ def check_frame(points: ControlPoints, view: View, of: str) -> None:
         raise InputError(
             f"GCP {name} (line {points.line[view.index[first]]}) is measured at col {col:.1f}, row "
             f"{row:.1f}, outside the {view.name} image {view.image.name} of {view.size[0]} x "
-            f"{view.size[1]} px (cols x rows)" + (f", and {others} more" if others else "") + of,
-            file=points.file,
+            f"{view.size[1]} px (cols x rows)" + (f", and {others} more" if others else ""),
             remedy="correct the measurement, or leave both cells empty where the image does not "
             "show the point",
         )
@@ -401,7 +393,7 @@ def _where(view: View) -> str:
     return f"{view.name} image {view.image.name}{beside}"
 
 
-def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: str) -> None:
+def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools) -> None:
     """Refuse a view whose used GCPs cannot carry the model."""
     defect = _defect(model, view.predicted[used])
     if not defect:
@@ -409,14 +401,13 @@ def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: s
     out = [points.ids[i] for i in view.index[~used]]
     rest = f" after {_some(out)} were left out" if out else ""
     raise TooFewPoints(
-        f"{_where(view)}: {defect}{rest}{of}",
-        file=points.file,
+        f"{_where(view)}: {defect}{rest}",
         remedy=_remedy(model, view.predicted[used]),
     )
 
 
 def refuse_misfit(
-    model: str, view: View, system: System, points: ControlPoints, used: Bools, of: str
+    model: str, view: View, system: System, points: ControlPoints, used: Bools
 ) -> float:
     """Refuse GCPs that contradict each other; sigma0 in px of those used."""
     n, kept = len(used), int(used.sum())
@@ -427,8 +418,7 @@ def refuse_misfit(
     if n - kept > MAX_LEFT_OUT * n:
         out = [points.ids[i] for i in view.index[~used]]
         raise InputError(
-            f"{where}: {len(out)} of {n} GCPs contradict the others ({_some(out)}){of}",
-            file=points.file,
+            f"{where}: {len(out)} of {n} GCPs contradict the others ({_some(out)})",
             remedy="check these GCPs, and that the file belongs to these images and their RPCs",
         )
     if n <= system.minimal + 2 and sigma > UNCHECKED_SIGMA:
@@ -437,23 +427,20 @@ def refuse_misfit(
         suspect = points.ids[view.index[int(np.argmax(far))]]
         raise InputError(
             f"{where}: the {n} GCPs contradict each other by {sigma:.1f} px, and so few do not "
-            f"tell which is wrong ({suspect} differs most from the others' shift){of}",
-            file=points.file,
+            f"tell which is wrong ({suspect} differs most from the others' shift)",
             remedy=f"check {suspect} first; measure more GCPs: among "
             f"{system.minimal + 3} or more a blunder is found and left out",
         )
     if sigma > MAX_SIGMA:
         raise InputError(
             f"{where}: the GCPs do not fit the image (sigma {sigma:.1f} px after the {model} "
-            f"correction){of}",
-            file=points.file,
+            f"correction)",
             remedy="check that GCP file, image and RPC belong together, and that heights are "
             "metres above the ellipsoid",
         )
     if (change := tilt(system.affine(system.solve(used)))) > MAX_TILT:
         raise InputError(
-            f"{where}: the GCPs ask for a change of scale or angle by {100 * change:.0f} %{of}",
-            file=points.file,
+            f"{where}: the GCPs ask for a change of scale or angle by {100 * change:.0f} %",
             remedy="check that columns count from the left and rows from the top, and that GCP "
             "file, image and RPC belong together",
         )

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ..core.numerics.robust import huber_weights, robust_sigma, tukey_weights
 from ..sensor.line_correction import LineCorrection
@@ -325,17 +326,14 @@ def _by_themselves(
     names = list(images)
     found = []
     for pair in pairs:
-        of_pair, ties = (pair.left, pair.right), pair.ties
-        prior = np.zeros((12, 12))
-        for k, name in enumerate(of_pair):
-            own = slice(6 * k, 6 * k + 6)
-            prior[own, own] = rpc_prior(images[name].start)
-        rows = tuple(images[name].start.size[1] for name in of_pair)
+        left, right = (images[name].start for name in (pair.left, pair.right))
+        prior = block_diag(rpc_prior(left), rpc_prior(right))
         # Blunders are looked for where the tie points were matched.
-        about = ties.equations.about(ties.linearised_at)
-        told = estimate_with_lines(about, prior, ties.common_px, rows)
+        about = pair.ties.equations.about(pair.ties.linearised_at)
+        rows = left.size[1], right.size[1]
+        told = estimate_with_lines(about, prior, pair.ties.common_px, rows)
         numbers = names.index(pair.left), names.index(pair.right)
-        found.append(PairOfLines(pair.scene, numbers, ties.equations, *told))
+        found.append(PairOfLines(pair.scene, numbers, pair.ties.equations, *told))
     return found
 
 
@@ -366,9 +364,7 @@ def fit_site(
     points = _Points.of(list(by_name.values()), lines)
     known = [_Pair.of(*both, lines) for both in zip(tied, by_itself)]
     count = 6 * len(names)
-    prior = np.zeros((count, count))
-    for k, image in enumerate(by_name.values()):
-        prior[np.ix_(_six(k), _six(k))] = np.linalg.inv(rpc_prior(image.start))
+    prior = block_diag(*(np.linalg.inv(rpc_prior(image.start)) for image in by_name.values()))
     free, x, of_fixed = _unknowns(names, fixed)
     point_weights, pair_weights = np.ones(len(points.delta)), np.ones(len(known))
     sigma, scatter = CAREFUL_SIGMA[0], 1.0
