@@ -26,9 +26,8 @@ from ..sensor.rpc import SensorModel
 from .adjustment import Estimate
 from .align import CAREFUL_SIGMA
 from .alignment import Alignment, GcpResidual
-from .lack_of_fit import SharedErrors
 from .line_fit import LineFit
-from .plan_place import plan_slopes
+from .shared_errors import SharedErrors, plan_slopes
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

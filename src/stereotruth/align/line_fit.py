@@ -33,8 +33,8 @@ from .adjustment import (
     estimate,
     root_of,
 )
-from .lack_of_fit import WIDEST, Steps, amount, climb
 from .records import Equations
+from .shared_errors import WIDEST, Steps, amount, climb
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]

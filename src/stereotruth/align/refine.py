@@ -6,7 +6,7 @@ both images have in common they see on slopes only, as LiDAR strips are co-regis
 heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
 settle the relative part, and the rest as far as they see it. Where that leaves the place in plan
-open, edges of roofs settle it (:mod:`.plan_place`).
+open, edges of roofs settle it (:mod:`.shared_errors`).
 
 The adjustment starts from what most tie points agree on, and blunders (moved or built since,
 vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
@@ -60,11 +60,10 @@ from .doubts import (
     remark_of,
     scatter_by_heights,
 )
-from .lack_of_fit import SharedErrors, with_shared_errors
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
-from .plan_place import place_pair
 from .records import Equations, spread_of
+from .shared_errors import SharedErrors, place_pair, with_shared_errors
 from .tie_points import Geometry, common_shift, match
 from .tie_sites import choose_sites, find_places
 
@@ -135,7 +134,7 @@ def _record(
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
         "of the images, and y-parallax; changes in px of the original images over the whole image; "
         "lidar_height: m, of LiDAR minus images, and from what on a fault is told; place_in_plan: "
-        "m (east, north), see plan_place",
+        "m (east, north), by slopes and by edges of roofs",
         "by_line": result.lines.figures(),
         "shared_by_near_sites": result.shared.figures(),
         "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),

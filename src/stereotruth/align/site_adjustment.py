@@ -19,8 +19,8 @@ from .align import LARGE_SHIFT
 from .alignment import Alignment, ViewFit
 from .control_points import NoPoints, read_gcps
 from .doubts import HEAVY, image_doubts
-from .plan_place import plan_slopes
 from .records import ScenePair, covariance_of, read_equations, read_site, rpc_alone
+from .shared_errors import plan_slopes
 from .site_fit import (
     LEAST_POINTS,
     FixedImages,

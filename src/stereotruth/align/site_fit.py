@@ -30,7 +30,6 @@ from .adjustment import FREE, MATCHING, Estimate, Sums, estimate
 from .align import CAREFUL_SIGMA
 from .alignment import ViewFit, rpc_prior
 from .gcp_checks import BLUNDER_FLOOR
-from .lack_of_fit import shared_spread, with_shared_errors
 from .line_fit import (
     LineFit,
     covariance_at_lines,
@@ -40,8 +39,8 @@ from .line_fit import (
     process,
     sums_of,
 )
-from .plan_place import PlanFrame, with_offsets
 from .records import Equations, PairEquations, PlanObservation, SiteLines
+from .shared_errors import PlanFrame, shared_spread, with_offsets, with_shared_errors
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -165,7 +164,7 @@ class PointsOfImage:
 @dataclass(frozen=True, eq=False)
 class ImageToFit:
     """An image: its fit by the RPC alone in coordinates of the image, its control points, and
-    ``px_per_m`` [2, 2] as of :func:`.plan_place.plan_slopes` in its middle."""
+    ``px_per_m`` [2, 2] as of :func:`.shared_errors.plan_slopes` in its middle."""
 
     name: str
     start: ViewFit

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stereotruth.align.adjustment import estimate
-from stereotruth.align.lack_of_fit import with_shared_errors
 from stereotruth.align.line_fit import LineFit, estimate_with_lines, line_design
 from stereotruth.align.records import Equations
+from stereotruth.align.shared_errors import with_shared_errors
 
 SIDE = 1100
 ROWS = (SIDE, SIDE)

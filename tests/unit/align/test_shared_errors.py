@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from stereotruth.align.alignment import Alignment, rpc_prior
-from stereotruth.align.plan_place import COMMON_M, PlanFrame, plan_slopes, with_offsets
 from stereotruth.align.records import PlanObservation, read_equations, write_equations
 from stereotruth.align.refine import refine
 from stereotruth.align.roof_edges import RoofEdges, find_roof_edges, plan_offset
+from stereotruth.align.shared_errors import COMMON_M, PlanFrame, plan_slopes, with_offsets
 from stereotruth.sensor.image_reader import open_pair
 from stereotruth.sensor.rpc import SensorModel
 
