@@ -1,4 +1,4 @@
-"""Images of a pair or a site, opened, and the ground of a pair by their RPCs alone.
+"""Images of a pair or a site, opened; the ground of a pair by their RPCs, and sites all over it.
 
 The ground of a pair is that whose LiDAR can have a say in its products. It is known before LiDAR is
 read and before anything is aligned: by the RPCs, with what they may be off and with the heights
@@ -27,6 +27,7 @@ from ..core.numerics.degrees import metres_per_degree, turn
 from ..core.numerics.hull import corners_of_hull
 from ..core.products.ungeoreferenced import open_raster
 from ..lidar.footprint import Footprint
+from ..lidar.point_store import PointStore
 from ..sensor.acquisition import Acquisition, by_sheet, read_acquisition
 from ..sensor.pair_geometry import find_overlap, find_rotation
 from ..sensor.rpc import SensorModel
@@ -38,6 +39,8 @@ from .alignment import RPC_SHIFT, RPC_TILT
 
 Floats = NDArray[np.float64]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
+Site = tuple[int, int, float, float]  # upper-left col, row px; lowest, highest point in m
+
 
 DEVIATIONS = 4.0  # of what RPCs are off
 HEIGHT_SHARE = 0.25  # of the RPCs' range of heights, that the ground may lie outside of it
@@ -45,6 +48,11 @@ EDGE = 33  # places along each side of a frame
 LEVELS = 7  # heights
 FARTHEST_LON = 179.0  # degrees: beyond, footprints are not told apart
 MOST_DEGREES = 10.0  # along a side of a footprint: more is none of one site
+SITES = 120  # about; each is read by itself
+SITE = 168  # px of the left image, side of a site
+MARGIN = 24  # px around a site whose points are looked at
+NOT_FIRM = (3, 4, 5, 9)  # ASPRS classes: vegetation, and water, which moves
+IS_FIRM = ~np.isin(np.arange(256), NOT_FIRM)  # by class
 PIXEL_M = (0.01, 1000.0)  # m on the ground
 PIXEL_RATIO = 2.0  # of the largest and smallest in an image, over the heights of its RPC
 GRID_SHIFT_M = 100.0  # between an image's map grid and its RPC: rounded corners and a loose RPC
@@ -262,3 +270,96 @@ def _hull(places: Sequence[tuple[Floats, Floats]]) -> Floats:
     if ground.shape[1] < 3:
         raise InputError("lines of sight do not meet the ground")
     return ground[:, corners_of_hull(*ground)]
+
+
+def _heights(
+    stores: Sequence[PointStore], lon: float, lat: float, reach: float
+) -> tuple[float, float] | None:
+    """Lowest and highest point (m) of the cells around a place; None where there are none."""
+    box = lon - reach, lat - reach, lon + reach, lat + reach
+    found = [
+        store.height_range(*box)
+        for store in stores
+        if store.bounds[0] <= box[2]
+        and store.bounds[2] >= box[0]
+        and store.bounds[1] <= box[3]
+        and store.bounds[3] >= box[1]
+    ]
+    found = [pair for pair in found if pair is not None]
+    return (min(p[0] for p in found), max(p[1] for p in found)) if found else None
+
+
+def _covered(
+    left: SensorModel,
+    right: SensorModel,
+    right_size: tuple[int, int],
+    stores: Sequence[PointStore],
+    height: float,
+    col: float,
+    row: float,
+) -> tuple[float, float] | None:
+    """Range of heights (m) at a left position that LiDAR and right image cover, else None.
+
+    ``height``: about that of the ground.
+    """
+    low = high = height
+    for _ in range(3):
+        lon, lat = (float(v) for v in left.localize(col, row, (low + high) / 2))
+        if not np.isfinite(lon):
+            return None
+        there = _heights(stores, lon, lat, 1e-5)
+        if there is None:
+            return None
+        low, high = there
+    c, r = right.project(lon, lat, (low + high) / 2)
+    return (low, high) if 0 <= c < right_size[0] and 0 <= r < right_size[1] else None
+
+
+def choose_sites(
+    left: SensorModel,
+    right: SensorModel,
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+    stores: Sequence[PointStore],
+    height: float,
+) -> list[Site]:
+    """(col, row, lowest, highest height in m) of sites: upper-left px in the left image.
+
+    Some SITES squares on a regular grid, apart from each other, over what both images and the
+    LiDAR cover. ``height``: about that of the ground, ellipsoidal m; points that lie elsewhere have
+    no say.
+    """
+    cols, rows = sizes[0]
+    if min(cols, rows) < SITE:
+        return []
+
+    def grid(spacing: float) -> list[Site]:
+        found = []
+        for row in np.arange(spacing / 2, rows, spacing):
+            for col in np.arange(spacing / 2, cols, spacing):
+                heights = _covered(left, right, sizes[1], stores, height, col, row)
+                if heights is not None:
+                    corner = (
+                        min(max(int(at) - SITE // 2, 0), n - SITE)
+                        for at, n in zip((col, row), (cols, rows))
+                    )
+                    found.append((*corner, *heights))
+        return found
+
+    coarse = max(np.sqrt(cols * rows / (2.0 * SITES)), SITE)
+    return grid(max(coarse * np.sqrt(max(len(grid(coarse)), 1) / SITES), SITE))
+
+
+def query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | None:
+    """(west, south, east, north) of all points that either image may show in a site, degrees."""
+    col0, row0, low, high = site
+    corner_cols, corner_rows = (
+        c.ravel() for c in np.meshgrid([-MARGIN, SITE + MARGIN], [-MARGIN, SITE + MARGIN])
+    )
+    middle = (low + high) / 2
+    ground = [left.localize(col0 + corner_cols, row0 + corner_rows, z) for z in (low, high)]
+    at_right = right.project(*left.localize(col0 + corner_cols, row0 + corner_rows, middle), middle)
+    ground += [right.localize(*at_right, z) for z in (low, high)]
+    ground = np.hstack([np.stack(g) for g in ground])
+    if not np.isfinite(ground).all():
+        return None
+    return np.concatenate([ground.min(axis=1), ground.max(axis=1)])

@@ -60,12 +60,12 @@ from .doubts import (
     remark_of,
     scatter_by_heights,
 )
+from .images import choose_sites
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
 from .records import Equations, spread_of
 from .shared_errors import SharedErrors, place_pair, with_shared_errors
-from .tie_points import Geometry, common_shift, match
-from .tie_sites import choose_sites, find_places
+from .tie_points import Geometry, common_shift, find_places, match
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]

@@ -31,9 +31,9 @@ from ..sensor.image_reader import Source
 from ..sensor.rpc import SensorModel
 from .adjustment import MATCHING, Estimate
 from .alignment import Alignment, ViewFit, over_the_image, parameters_of
+from .images import IS_FIRM, choose_sites, query_box
 from .records import Equations, PlanObservation
 from .roof_edges import ROOF_RIM_M, PlanOffset, RoofEdges, find_roof_edges, plan_offset
-from .tie_sites import IS_FIRM, choose_sites, query_box
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]

@@ -9,8 +9,7 @@ import pyproj
 import pytest
 import rasterio
 
-from stereotruth.align.images import footprint_of, pair_outlines
-from stereotruth.align.tie_sites import choose_sites
+from stereotruth.align.images import choose_sites, footprint_of, pair_outlines
 from stereotruth.core.products.grids import open_grid
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.lidar.footprint import CELL_DEG, Footprint
