@@ -21,7 +21,7 @@ from synthetic_pairs import label_by, labels_of
 
 from stereocities.cities import CITIES
 from stereotruth.align.align import align
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.core import sheets
 from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.config.section import merged
@@ -240,7 +240,7 @@ class Made:
 
     def before(self, model: EpipolarModel) -> EpipolarModel:
         """The epipolar model by the ground control points alone; ``model``: the one in use."""
-        aligned = Alignment.load(self.aligned)
+        aligned = Alignment.read(self.aligned)
         sizes = model.left_size, model.right_size
         return fit_epipolar(aligned.left, aligned.right, *sizes, aligned.reference_height)
 

@@ -32,7 +32,7 @@ from stereocities.cities import CITIES, CitySpec
 from stereocities.sites import make_scene
 from stereocities.surfaces import ROOF, WATER
 from stereocities.truth import truth_at
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.lidar.point_store import PointStore
 from stereotruth.sensor.rpc import SensorModel
@@ -290,7 +290,7 @@ def main() -> None:
     rows = {"this project": make_ours(folder, city, given.cores)}
     made = folder / "results"
     store = PointStore(next((made / "ingest" / city.name / scene).glob("*.points")))
-    alignment = Alignment.load(made / f"refine/{city.name}/{scene}/alignment.json")
+    alignment = Alignment.read(made / f"refine/{city.name}/{scene}/alignment.json")
     cars = given.cars.absolute()
     rows["CARS"] = make_cars(folder / "cars", cars, folder / "in", store, alignment, given.cores)
 

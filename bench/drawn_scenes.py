@@ -35,7 +35,7 @@ from stereocities.truth import SURFACES, truth_at
 from stereocities.twin_world import twin_city
 from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align, from_rpcs
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.align.refine import refine
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.numerics.statistics import ErrorSum
@@ -414,7 +414,7 @@ def _compared(
             label_by(refined, scene.images, scene.stores, scratch, settings, workers=workers)
             write_grid_truth(scene.city, scene.spec, scratch / "epipolar.json",
                              scratch / "truth.zarr", workers=workers)  # fmt: skip
-    used = Alignment.load(made / "alignment.json")
+    used = Alignment.read(made / "alignment.json")
     labels = compare_scene(
         made / "disparity.zarr", made / "truth.zarr", None, scene=title, workers=workers
     )

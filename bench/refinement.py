@@ -30,7 +30,7 @@ from stereocities.render import prepare
 from stereocities.surfaces import GROUND, TREE, terrain_heights
 from stereocities.truth import truth_at
 from stereotruth.align.adjustment import epipolar_model
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.align.label_uncertainty import label_covariance
 from stereotruth.align.refine import refine
 from stereotruth.core.errors import InputError

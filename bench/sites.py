@@ -34,12 +34,11 @@ from stereocities.sites import (
 )
 from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align, from_rpcs
-from stereotruth.align.aligned_pair import Alignment
-from stereotruth.align.gcp_checks import open_view
+from stereotruth.align.alignment import Alignment
+from stereotruth.align.images import open_view
+from stereotruth.align.records import ScenePair, pair_alignment, write_equations
 from stereotruth.align.refine import refine
 from stereotruth.align.site_adjustment import adjust_site
-from stereotruth.align.site_pair import ScenePair, pair_alignment
-from stereotruth.align.tie_equations import write_equations
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import atomic_folder, write_table
@@ -186,7 +185,7 @@ def of_site(number: int, options: argparse.Namespace) -> list[list[str]]:
     rows = []
     for count in (15, 4):
         pairs = [refined(folder, names, count) for names in chosen]
-        alone = {pair.scene: Alignment.load(pair.alignment) for pair in pairs}
+        alone = {pair.scene: Alignment.read(pair.alignment) for pair in pairs}
         adjusted = adjust_site(site.city.name, pairs)
         together = sensors_of(adjusted, pairs)
         noiseless = some_points(folder, count, table="exact")
@@ -283,7 +282,7 @@ def pairs_by_case(number: int, options: argparse.Namespace) -> dict[str, list[Pa
         together = pair_alignment(adjusted, pair)
         if "refused" in together:
             continue
-        alignments = Alignment.from_dict(together), Alignment.load(pair.alignment)
+        alignments = Alignment.from_dict(together), Alignment.read(pair.alignment)
         for case, alignment in zip(CASES, alignments):
             found[case].append(labelled(folder, pair, alignment, surface, case))
     return found

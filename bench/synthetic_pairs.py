@@ -25,7 +25,7 @@ from stereocities.lidar import simulate_lidar_tile
 from stereocities.render import simulate_image
 from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.align.refine import refine
 from stereotruth.core.config.configuration import Configuration, LabelSettings
 from stereotruth.core.numerics.geometry import DEGREE_M

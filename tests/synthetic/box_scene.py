@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from stereotruth.align.aligned_pair import Alignment, ViewFit
+from stereotruth.align.alignment import Alignment, ViewFit
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid, open_grid
 from stereotruth.epipolar.fit import fit_epipolar

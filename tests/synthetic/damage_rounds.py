@@ -24,10 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from stereotruth.align.align import align
-from stereotruth.align.align_figure import draw_residuals
-from stereotruth.align.align_report import write_alignment
-from stereotruth.align.gcp_checks import open_view
+from stereotruth.align.align import align, write_alignment
+from stereotruth.align.figures import draw_residuals
+from stereotruth.align.images import open_view
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import PointStore

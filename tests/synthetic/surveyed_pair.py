@@ -9,7 +9,7 @@ import numpy as np
 import rasterio
 
 from stereotruth.align.align import align
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.align.control_points import COLUMNS
 from stereotruth.sensor.rpc import RPC, SensorModel
 

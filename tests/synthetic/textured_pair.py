@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereotruth.align.aligned_pair import Alignment, ViewFit
+from stereotruth.align.alignment import Alignment, ViewFit
 from stereotruth.sensor.rpc import SensorModel
 
 from .cameras import BACKWARD, FORWARD, HEIGHT, camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from stereotruth.align.align import align
-from stereotruth.align.align_figure import draw_residuals
+from stereotruth.align.figures import draw_residuals
 
 from ..synthetic.damage_rounds import REST, rounds
 from ..synthetic.damaged_cases import synthetic_cases

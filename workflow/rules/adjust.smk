@@ -50,7 +50,7 @@ rule adjusted_alignment:
     params:
         sources=upstream("adjusted_alignment"),
         images=lambda w: ADJUSTED[w.scene],
-        code=source_digest("stereotruth.align.site_pair"),
+        code=source_digest("stereotruth.align.records"),
     message:
         "Alignment of scene {wildcards.scene} by its adjusted images"
     script:

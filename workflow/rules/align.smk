@@ -27,7 +27,7 @@ rule align:
         strict=SETTINGS.strict,
         epoch=lambda w: epoch_of(w.city),
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
-        code=source_digest("stereotruth.align.align", "stereotruth.align.align_report"),
+        code=source_digest("stereotruth.align.align"),
     message:
         "Aligning scene {wildcards.scene} to its ground control points"
     script:
@@ -55,7 +55,7 @@ rule draw_residuals:
         runtime=10,
     params:
         sources=upstream("draw_residuals"),
-        code=source_digest("stereotruth.align.align_figure"),
+        code=source_digest("stereotruth.align.figures"),
     message:
         "Drawing the residuals of scene {wildcards.scene}"
     script:

@@ -50,7 +50,7 @@ rule export:
             "seed": SETTINGS.seed,
             "strict": SETTINGS.strict,
         },
-        code=source_digest("stereotruth.tiles.export", "stereotruth.align.aligned_pair"),
+        code=source_digest("stereotruth.tiles.export", "stereotruth.align.alignment"),
     message:
         "Cutting the tiles of {wildcards.city}"
     script:

@@ -116,7 +116,7 @@ def ground_of_stores(scene):
     It is that of all scenes that take points of them. Cities that are made have no images yet when
     their points are planned.
     """
-    from stereotruth.align.pair_ground import footprint_of  # for few jobs
+    from stereotruth.align.images import footprint_of  # for few jobs
 
     margin_m = SETTINGS.ingest.margin_m
     if margin_m is None or is_synthetic(SCENES[scene]):

@@ -26,7 +26,7 @@ rule rectify:
         code=source_digest(
             "stereotruth.epipolar.rectify",
             "stereotruth.epipolar.fit",
-            "stereotruth.align.aligned_pair",
+            "stereotruth.align.alignment",
         ),
     message:
         "Making epipolar images of scene {wildcards.scene}"
@@ -57,7 +57,7 @@ use rule rectify as rectify_strip with:
         code=source_digest(
             "stereotruth.epipolar.rectify",
             "stereotruth.epipolar.fit",
-            "stereotruth.align.aligned_pair",
+            "stereotruth.align.alignment",
         ),
     message:
         "Making strip {wildcards.strip} of the epipolar images of scene {wildcards.scene}"

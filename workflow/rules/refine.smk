@@ -29,11 +29,7 @@ rule refine:
         strict=SETTINGS.strict,
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
         bands=SETTINGS.rectify.model_dump(),
-        code=source_digest(
-            "stereotruth.align.refine",
-            "stereotruth.align.refine_report",
-            "stereotruth.align.tie_equations",
-        ),
+        code=source_digest("stereotruth.align.refine", "stereotruth.align.records"),
     message:
         "Refining the alignment of scene {wildcards.scene} by LiDAR and images"
     script:
@@ -63,7 +59,7 @@ rule draw_refinement:
         runtime=10,
     params:
         sources=upstream("draw_refinement"),
-        code=source_digest("stereotruth.align.refine_figure"),
+        code=source_digest("stereotruth.align.figures"),
     message:
         "Drawing the tie points of scene {wildcards.scene}"
     script:

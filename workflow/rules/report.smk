@@ -72,7 +72,7 @@ rule report_site:
         scenes=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
         code=source_digest(
             "stereotruth.evaluate.report.site_page",
-            "stereotruth.align.site_images",
+            "stereotruth.align.images",
             "stereotruth.lidar.point_statistics",
         ),
         templates=templates_of("stereotruth/evaluate/report/site_page.html.jinja"),

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from stereotruth.align.records import ScenePair, write_site
 from stereotruth.align.site_adjustment import adjust_site
-from stereotruth.align.site_pair import ScenePair, write_site
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, file_sha256
 from stereotruth.lidar.frames import Epoch

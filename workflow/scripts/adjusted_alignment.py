@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from stereotruth.align.site_pair import ScenePair, pair_alignment, read_site, write_site
+from stereotruth.align.records import ScenePair, pair_alignment, read_site, write_site
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, digest
 

@@ -3,8 +3,7 @@
 import logging
 from contextlib import suppress
 
-from stereotruth.align.align import align, from_rpcs
-from stereotruth.align.align_report import write_alignment
+from stereotruth.align.align import align, from_rpcs, write_alignment
 from stereotruth.align.control_points import TooFewPoints, read_gcps
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.making import rule_job

@@ -24,7 +24,7 @@ if __name__ == "__main__":
             given.alignment,
             of_right,
             snakemake.params.acquired,
-            map(Alignment.load, given.alignment),
+            map(Alignment.read, given.alignment),
         )
         made = snakemake.output
         summary = export_city(

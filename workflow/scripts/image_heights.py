@@ -1,6 +1,6 @@
 """Heights, positions and classes of what an original image shows."""
 
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe
 from stereotruth.labels.image_heights import open_inputs, write_image_heights
@@ -8,7 +8,7 @@ from stereotruth.labels.image_heights import open_inputs, write_image_heights
 if __name__ == "__main__":
     image, view = snakemake.wildcards.image, snakemake.params.view
     with rule_job(snakemake, f"heights {image}"):
-        alignment = Alignment.load(snakemake.input.alignment)
+        alignment = Alignment.read(snakemake.input.alignment)
         fit = getattr(alignment, f"{view}_fit")
         inputs = open_inputs(
             getattr(alignment, view),

@@ -1,6 +1,6 @@
 """One aligned pair to epipolar images, or to one strip of their blocks."""
 
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.alignment import Alignment
 from stereotruth.core.config.configuration import Rectify
 from stereotruth.core.products.grids import Strip
 from stereotruth.core.products.making import rule_job
@@ -14,7 +14,7 @@ if __name__ == "__main__":
     strip, bands = Strip.of_wildcards(snakemake.wildcards), snakemake.params.bands
     names, masks = (given.left[0], given.right[0]), (given.left_mask, given.right_mask)
     with rule_job(snakemake, f"rectify {scene} {strip or ''}".strip()):
-        alignment = Alignment.load(given.alignment)
+        alignment = Alignment.read(given.alignment)
         with open_pair(*names, *masks, bands=Rectify(**bands)) as (left, right):
             model = fit_epipolar(
                 alignment.left,

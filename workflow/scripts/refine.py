@@ -1,9 +1,8 @@
 """What is left between one scene's LiDAR and its two images, taken out of the alignment."""
 
-from stereotruth.align.aligned_pair import Alignment
-from stereotruth.align.refine import refine
-from stereotruth.align.refine_report import write_refinement
-from stereotruth.align.tie_equations import write_equations
+from stereotruth.align.alignment import Alignment
+from stereotruth.align.records import write_equations
+from stereotruth.align.refine import refine, write_refinement
 from stereotruth.core.config.configuration import Rectify
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, digest
@@ -18,7 +17,7 @@ if __name__ == "__main__":
         for store in map(PointStore, given.points):
             inputs[f"points/{store.path.name}"] = digest(store.attrs.get("provenance", {}))
         alignment, observations = refine(
-            Alignment.load(given.alignment),
+            Alignment.read(given.alignment),
             given.left[0],
             given.right[0],
             given.points,

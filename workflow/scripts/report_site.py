@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from stereotruth.align.site_images import GivenImage, open_image
+from stereotruth.align.images import GivenImage, open_image
 from stereotruth.core.products.files import read_json
 from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.report.index_page import write_index

@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from ..core.numerics.statistics import TUKEY, robust_sigma, tukey_weights
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
-from ..sensor.rpc import LineCorrection, SensorModel
-from .align import RPC_TILT
-from .aligned_pair import Alignment, ViewFit, over_the_image
-from .equations import Equations, PairEquations
+from .alignment import Alignment, over_the_image, parameters_of
+from .records import Equations, PairEquations
 from .tie_points import Geometry, TiePoints
 
 Bools = NDArray[np.bool_]
@@ -72,11 +71,15 @@ class Estimate:
     statistic: float
     freedom: int
     contradiction: float
-    contradiction_freedom: int
     root: Floats
     normal: Floats
     alone: Floats
     information: Floats
+
+    @property
+    def chance(self) -> float:
+        """Probability of so large a change by chance."""
+        return float(f"{chdtrc(self.freedom, self.statistic):.3g}")
 
     def amount_along(self, direction: Floats) -> tuple[float, float]:
         """By how much of a direction [12] observations and prior differ, and its deviation.
@@ -90,22 +93,6 @@ class Estimate:
         information = float(along @ both @ along)
         observed = np.linalg.pinv(self.root) @ self.alone
         return float(along @ both @ observed) / information, information**-0.5
-
-
-def prior_of(alignment: Alignment) -> Floats:
-    """Covariance [12, 12] of both fits; what a simpler model keeps fixed may be off as RPCs are."""
-    prior = alignment.covariance.copy()
-    if alignment.model == "affine":
-        return prior
-    free = np.zeros((6, 6))
-    free[[0, 1, 3, 4], [0, 1, 3, 4]] = 1.0
-    if alignment.model == "similarity":
-        for turn in ([1, 0, 0, 0, 1, 0], [0, -1, 0, 1, 0, 0]):
-            free -= np.outer(turn, turn) / 2.0
-    for k, fit in enumerate(alignment.fits):
-        own = slice(6 * k, 6 * k + 6)
-        prior[own, own] += free * (RPC_TILT * fit.scale) ** 2
-    return prior
 
 
 def root_of(covariance: Floats) -> Floats:
@@ -278,7 +265,6 @@ def estimate(equations: Equations, prior: Floats, common_px: float = 0.0) -> Est
         float(np.sum(squares / values)),
         int(seen.sum()),
         float(np.sum(squares / (values + values**2))),
-        int(seen.sum()),
         root,
         normal,
         root @ alone,
@@ -314,13 +300,6 @@ def linearised_at(
     return np.concatenate([-slopes @ ties.carry @ left, slopes @ right], axis=-1), slopes
 
 
-def parameters_of(fit: ViewFit) -> Floats:
-    """[6] of a fit's affine against none, in the order of ``covariance`` and its coordinates."""
-    change = fit.affine - np.eye(2, 3)
-    at_origin = change[:, 2] + change[:, :2] @ np.array(fit.origin)
-    return np.column_stack([change[:, :2] * fit.scale, at_origin]).ravel()
-
-
 def pair_equations(
     start: Alignment,
     current: Alignment,
@@ -345,36 +324,6 @@ def pair_equations(
     observed = np.einsum("nab,nb->na", slopes, ties.shift) + design @ at + by_line
     equations = Equations(design, observed, ties.sigma, ties.site, ties.left, ties.right)
     return PairEquations(equations, parameters(start), at, places, common_px)
-
-
-def with_corrections(
-    alignment: Alignment,
-    parameters: Floats,
-    by_line: tuple[LineCorrection | None, LineCorrection | None] = (None, None),
-) -> Alignment:
-    """The alignment with both affines moved by parameters [12], and corrections by line."""
-    fits, sensors = [], []
-    for fit, sensor, own, lines in zip(
-        alignment.fits,
-        (alignment.left, alignment.right),
-        (parameters[:6], parameters[6:]),
-        by_line,
-    ):
-        affine = fit.moved(own)
-        sensors.append(SensorModel(sensor.rpc, affine, lines))
-        gcps = []
-        for gcp in fit.gcps:
-            at = affine @ (*gcp.predicted, 1.0)
-            after = np.array(gcp.measured) - (at if lines is None else np.array(lines.add(*at)))
-            gcps.append(replace(gcp, after=tuple(after.tolist())))
-        fits.append(replace(fit, affine=affine, gcps=tuple(gcps)))
-    return replace(
-        alignment,
-        left=sensors[0],
-        right=sensors[1],
-        left_fit=fits[0],
-        right_fit=fits[1],
-    )
 
 
 def epipolar_model(alignment: Alignment) -> EpipolarModel:

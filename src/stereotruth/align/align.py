@@ -2,7 +2,7 @@
 
 GCPs are projected by the RPC of each image, and an affine transformation (or a similarity, or a
 shift) is fitted that takes the projected to the measured image coordinates. Blunders are left out
-and named (see ``robust_fit``).
+and named (see :mod:`.gcp_checks`).
 
 Image coordinates are (col, row) in px, (0, 0) at the centre of the upper-left pixel; ground is
 WGS 84 longitude, latitude in degrees and ellipsoidal height in m.
@@ -21,24 +21,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.products.files import write_table
 from ..core.products.provenance import describe, source_digest
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..sensor.rpc import SensorModel
-from .aligned_pair import Alignment, GcpResidual, ViewFit
+from .alignment import (
+    PAIRS,
+    RPC_SHIFT,
+    Alignment,
+    GcpResidual,
+    ViewFit,
+    over_the_image,
+    rpc_prior,
+)
 from .control_points import ControlPoints, read_gcps
 from .gcp_checks import (
+    BLUNDER_FLOOR,
+    MINIMAL,
+    System,
     View,
     check_frame,
     check_ground,
     check_heights,
     check_swapped,
+    find_blunders,
     footprint,
-    open_view,
+    leave_one_out_residuals,
     refuse_fit,
     refuse_misfit,
     tilt,
 )
-from .robust_fit import BLUNDER_FLOOR, MINIMAL, System, find_blunders, leave_one_out_residuals
+from .images import open_view
 
 log = logging.getLogger("stereotruth")
 Bools = NDArray[np.bool_]
@@ -49,8 +62,6 @@ POOR_SIGMA = 2.0  # px
 # A careful measurement in px, and for how many degrees of freedom it stands beside the residuals
 # when these are few: 4 GCPs leave two, and may agree by chance.
 CAREFUL_SIGMA = (0.25, 2)
-RPC_SHIFT = 10.0  # px, standard deviation of what an RPC without GCPs is off, and
-RPC_TILT = 3e-4  # of its scale, rotation and shear
 PLACES_BY_RPCS = (
     f"no ground control points: places on the ground are known to about {RPC_SHIFT:g} px only, as "
     "the RPCs give them"
@@ -59,52 +70,65 @@ LARGE_SHIFT = 200.0  # px: RPCs err by some 1 to 50 px
 LARGE_TILT = 0.005  # change of scale, rotation or shear; RPCs err by less than 0.001
 
 
-def _view_fit(
-    view: View,
-    system: System,
-    points: ControlPoints,
-    used: Bools,
-    reasons: Mapping[int, str],
-    sigma: float,
-) -> ViewFit:
-    """The exact fit on the used points, with its figures."""
-    parameters = system.solve(used)
-    affine = system.affine(parameters)
-    after = system.residuals(parameters)
-    one_out = leave_one_out_residuals(system, used)
-    cofactors = system.embed @ system.cofactors(used) @ system.embed.T
-    redundancy = 2 * int(used.sum()) - system.design.shape[2]
-    careful, weight = CAREFUL_SIGMA
-    variance = (redundancy * sigma**2 + weight * careful**2) / (redundancy + weight)
-    table = []
-    for k, i in enumerate(view.index):
-        table.append(
-            GcpResidual(
-                id=points.ids[i],
-                lon=float(points.lon[i]),
-                lat=float(points.lat[i]),
-                height=float(points.height[i]),
-                measured=tuple(view.measured[k].tolist()),
-                predicted=tuple(view.predicted[k].tolist()),
-                before=tuple(system.delta[k].tolist()),
-                after=tuple(after[k].tolist()),
-                leave_one_out=tuple(one_out[k].tolist()),
-                used=bool(used[k]),
-                reason=reasons.get(int(i), ""),
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """The fit of a view while its blunders are looked for.
+
+    ``used`` bool[n] of the view's points; ``lengths`` [n]: their studentised residuals, px;
+    ``limit`` px: above, a point is a blunder.
+    """
+
+    view: View
+    system: System
+    used: Bools
+    lengths: Floats
+    limit: float
+
+    @property
+    def left_out(self) -> set[int]:
+        """Rows of the table that are left out."""
+        return set(self.view.index[~self.used].tolist())
+
+    def fit(self, model: str, points: ControlPoints, out_in_other: set[int]) -> ViewFit:
+        """The exact fit to what is used; InputError if that is too little, or does not fit."""
+        view, system, used = self.view, self.system, self.used
+        refuse_fit(model, view, points, used)
+        sigma = refuse_misfit(model, view, system, points, used)
+        parameters = system.solve(used)
+        after = system.residuals(parameters)
+        one_out = leave_one_out_residuals(system, used)
+        table = []
+        for k, i in enumerate(view.index.tolist()):
+            cause = (
+                "off in both images: wrong ground coordinates?"
+                if i in out_in_other
+                else "off in this image only: wrong measurement?"
             )
+            pairs = view.measured[k], view.predicted[k], system.delta[k], after[k], one_out[k]
+            table.append(
+                GcpResidual(
+                    points.ids[i],
+                    *(float(values[i]) for values in (points.lon, points.lat, points.height)),
+                    *(tuple(pair.tolist()) for pair in pairs),
+                    used=bool(used[k]),
+                    reason="" if used[k] else f"{np.hypot(*after[k]):.1f} px off; {cause}",
+                )
+            )
+        redundancy = 2 * int(used.sum()) - system.design.shape[2]
+        careful, weight = CAREFUL_SIGMA
+        variance = (redundancy * sigma**2 + weight * careful**2) / (redundancy + weight)
+        return ViewFit(
+            view=view.name,
+            image=view.image.name,
+            size=view.size,
+            affine=system.affine(parameters),
+            gcps=tuple(table),
+            sigma0=sigma,
+            redundancy=redundancy,
+            origin=tuple(system.origin.tolist()),
+            scale=system.scale,
+            covariance=variance * (system.embed @ system.cofactors(used) @ system.embed.T),
         )
-    return ViewFit(
-        view=view.name,
-        image=view.image.name,
-        size=view.size,
-        affine=affine,
-        gcps=tuple(table),
-        sigma0=sigma,
-        redundancy=redundancy,
-        origin=tuple(system.origin.tolist()),
-        scale=system.scale,
-        covariance=variance * cofactors,
-    )
 
 
 def _doubts(fit: ViewFit, model: str) -> list[str]:
@@ -165,31 +189,11 @@ def align(
     points = read_gcps(gcps_csv, scene, names, epoch)
     opened = [open_view(n, image, of) for n, image in zip(("left", "right"), images)]
     sensors = opened[0][0], opened[1][0]
-    near = check_ground(points, [footprint(*item) for item in opened], images, of)
-    check_swapped(points, sensors, near, of)
-
-    doubts = list(points.remarks)
-    doubts += [text for text in {check_heights(points, sensor): None for sensor in sensors} if text]
-    for name, ok in zip(points.ids, near):
-        if not ok:
-            doubts.append(f"GCP {name} left out, its ground coordinates are far from the images")
-
-    trials = []
-    for name, image, (sensor, size), measured in zip(
-        ("left", "right"), images, opened, (points.left, points.right)
-    ):
-        seen = np.isfinite(measured[:, 0])
-        projected = np.stack(sensor.project(points.lon, points.lat, points.height), axis=1)
-        index = np.flatnonzero(seen & near & np.isfinite(projected).all(axis=1))
-        view = View(name, image, size, sensor, index, projected[index], measured[index])
-        check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]), of)
-        trials.append(_Trial.of(model, view, points, seed, of))
-    if points.frame and points.frame["source"]["legs"]:
-        legs = "; ".join(points.frame["source"]["legs"])
-        log.info("GCPs of frame %s brought to ITRF2020: %s", points.frame["source"]["frame"], legs)
-    _leave_out_of_both(trials)
-    out = [trial.left_out for trial in trials]
-    fits = [trial.fit(model, points, other, of) for trial, other in zip(trials, reversed(out))]
+    try:
+        fits, doubts = _fit_views(points, images, opened, model, seed)
+    except InputError as error:
+        file = error.file or points.file
+        raise type(error)(error.problem + of, file=file, remedy=error.remedy) from None
     for fit in fits:
         doubts += _doubts(fit, model)
     _tell(fits, model, doubts)
@@ -218,52 +222,45 @@ def align(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """The fit of a view while its blunders are looked for.
+def _fit_views(
+    points: ControlPoints,
+    images: tuple[Path, Path],
+    opened: Sequence[tuple[SensorModel, tuple[int, int]]],
+    model: str,
+    seed: int,
+) -> tuple[list[ViewFit], list[str]]:
+    """The fits of both views, and doubts about the points. What is refused does not name the scene
+    yet."""
+    near = check_ground(points, [footprint(*item) for item in opened], images)
+    check_swapped(points, [sensor for sensor, _ in opened], near)
 
-    ``used`` bool[n] of the view's points; ``lengths`` [n]: their studentised residuals, px;
-    ``limit`` px: above, a point is a blunder.
-    """
+    doubts = list(points.remarks)
+    doubts += [
+        text for text in {check_heights(points, sensor): None for sensor, _ in opened} if text
+    ]
+    for name, ok in zip(points.ids, near):
+        if not ok:
+            doubts.append(f"GCP {name} left out, its ground coordinates are far from the images")
 
-    view: View
-    system: System
-    used: Bools
-    lengths: Floats
-    limit: float
-
-    @classmethod
-    def of(cls, model: str, view: View, points: ControlPoints, seed: int, of: str) -> _Trial:
-        """Without the blunders that the view shows by itself.
-
-        Raises InputError if its points are too few, or lie on one line.
-        """
-        refuse_fit(model, view, points, np.ones(len(view.index), dtype=bool), of)
+    trials = []
+    for name, image, (sensor, size), measured in zip(
+        ("left", "right"), images, opened, (points.left, points.right)
+    ):
+        seen = np.isfinite(measured[:, 0])
+        projected = np.stack(sensor.project(points.lon, points.lat, points.height), axis=1)
+        index = np.flatnonzero(seen & near & np.isfinite(projected).all(axis=1))
+        view = View(name, image, size, sensor, index, projected[index], measured[index])
+        check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]))
+        refuse_fit(model, view, points, np.ones(len(index), dtype=bool))
         system = System.of(model, view.predicted, view.measured)
-        return cls(view, system, *find_blunders(system, floor=BLUNDER_FLOOR, seed=seed))
-
-    @property
-    def left_out(self) -> set[int]:
-        """Rows of the table that are left out."""
-        return set(self.view.index[~self.used].tolist())
-
-    def fit(self, model: str, points: ControlPoints, out_in_other: set[int], of: str) -> ViewFit:
-        """The fit to what is used; InputError if that is too little, or does not fit."""
-        view, system, kept = self.view, self.system, self.used
-        refuse_fit(model, view, points, kept, of)
-        sigma = refuse_misfit(model, view, system, points, kept, of)
-        misses = np.hypot(*system.residuals(system.solve(kept)).T)
-        reasons = {}
-        for j, i in enumerate(view.index):
-            if not kept[j]:
-                both = int(i) in out_in_other
-                cause = (
-                    "off in both images: wrong ground coordinates?"
-                    if both
-                    else "off in this image only: wrong measurement?"
-                )
-                reasons[int(i)] = f"{misses[j]:.1f} px off; {cause}"
-        return _view_fit(view, system, points, kept, reasons, sigma)
+        trials.append(_Trial(view, system, *find_blunders(system, floor=BLUNDER_FLOOR, seed=seed)))
+    if points.frame and points.frame["source"]["legs"]:
+        legs = "; ".join(points.frame["source"]["legs"])
+        log.info("GCPs of frame %s brought to ITRF2020: %s", points.frame["source"]["frame"], legs)
+    _leave_out_of_both(trials)
+    out = [trial.left_out for trial in trials]
+    fits = [trial.fit(model, points, other) for trial, other in zip(trials, reversed(out))]
+    return fits, doubts
 
 
 def _leave_out_of_both(trials: Sequence[_Trial]) -> None:
@@ -314,22 +311,12 @@ def from_rpcs(
     sensors, fits = [], []
     for name, image in (("left", Path(left_image)), ("right", Path(right_image))):
         sensor, size = open_view(name, image, of)
-        scale = max(size) / 2
-        tilt_variance = (RPC_TILT * scale) ** 2
-        fits.append(
-            ViewFit(
-                view=name,
-                image=image.name,
-                size=size,
-                affine=np.array(sensor.affine),
-                gcps=(),
-                sigma0=math.nan,
-                redundancy=0,
-                origin=((size[0] - 1) / 2, (size[1] - 1) / 2),
-                scale=scale,
-                covariance=np.diag([tilt_variance, tilt_variance, RPC_SHIFT**2] * 2),
-            )
+        affine = np.array(sensor.affine)
+        fit = ViewFit(
+            name, image.name, size, affine, (), math.nan, 0, (0.0, 0.0), 1.0, np.zeros((6, 6))
         )
+        fit = over_the_image(fit)
+        fits.append(replace(fit, covariance=rpc_prior(fit)))
         sensors.append(sensor)
     log.warning("warning: %s", PLACES_BY_RPCS)
     if provenance is None:
@@ -347,3 +334,20 @@ def from_rpcs(
         warnings=(PLACES_BY_RPCS,),
         provenance=dict(provenance),
     )
+
+
+def write_alignment(alignment: Alignment, json_file: str | Path, csv_file: str | Path) -> None:
+    """Write the alignment (JSON) and the residuals of every GCP (CSV, px)."""
+    axes = [(name, k, axis) for name in PAIRS for k, axis in enumerate(("col", "row"))]
+    rows = []
+    for fit in alignment.fits:
+        for g in fit.gcps:
+            row = {"view": fit.view, "id": g.id, "used": "yes" if g.used else "no"}
+            row |= {"lon_deg": f"{g.lon:.10f}", "lat_deg": f"{g.lat:.10f}"}
+            row |= {"height_m": f"{g.height:.4f}"}
+            row |= {f"{name}_{axis}_px": f"{getattr(g, name)[k]:.4f}" for name, k, axis in axes}
+            rows.append(row | {"reason": g.reason})
+    columns = ["view", "id", "used", "lon_deg", "lat_deg", "height_m"]
+    columns += [f"{name}_{axis}_px" for name, _, axis in axes] + ["reason"]
+    write_table(csv_file, rows, columns)
+    alignment.save(json_file)

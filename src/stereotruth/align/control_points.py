@@ -96,37 +96,40 @@ def read_gcps(
     Raises InputError, naming the file and the line, for anything else that is not as it should be.
     """
     file = Path(file)
-    of = f" (scene {scene})" if scene else ""
-
-    def fail(problem: str, remedy: str, kind: type[InputError] = InputError) -> InputError:
-        return kind(problem + of, file=file, remedy=remedy)
-
     try:
-        table = _table(file)
+        return _read(file, images, epoch)
     except InputError as error:
-        raise fail(error.problem, error.remedy) from None
-    rows = table.rows
-    if "image" in table.columns:
-        rows = _as_pair(rows, images, fail)
+        of = f" (scene {scene})" if scene else ""
+        raise type(error)(error.problem + of, file=file, remedy=error.remedy) from None
+
+
+def _read(file: Path, images: tuple[str, str] | None, epoch: Epoch) -> ControlPoints:
+    """The points; what is refused does not name the file yet."""
+    table = _table(file)
+    rows = _as_pair(table.rows, images) if "image" in table.columns else table.rows
     points: dict[str, tuple[int, list[float]]] = {}
     for line, cells in rows:
         name = of_text(cells["id"])
         if not name:
-            raise fail(f"line {line}: the id is empty", "give every point an id of its own")
+            raise InputError(
+                f"line {line}: the id is empty", remedy="give every point an id of its own"
+            )
         if name in points:
-            raise fail(
+            raise InputError(
                 f"lines {points[name][0]} and {line} both have the id {name!r}",
-                "give every point an id of its own",
+                remedy="give every point an id of its own",
             )
         if len(name) > LONGEST_ID or not name.isprintable():
-            raise fail(
+            raise InputError(
                 f"line {line}: the id {name[:20]!a} … of {len(name)} characters is no name",
-                f"give ids of at most {LONGEST_ID} characters that can be printed",
+                remedy=f"give ids of at most {LONGEST_ID} characters that can be printed",
             )
-        points[name] = line, _values(name, line, cells, fail)
+        points[name] = line, _values(name, line, cells)
     if not points:
-        raise fail("there are no points in the file", "add one line per point under the header")
-    _refuse_copies(points, fail)
+        raise InputError(
+            "there are no points in the file", remedy="add one line per point under the header"
+        )
+    _refuse_copies(points)
     ids = sorted(points)
     values = np.array([points[name][1] for name in ids])
     found = ControlPoints(
@@ -139,35 +142,34 @@ def read_gcps(
         left=values[:, 3:5].copy(),
         right=values[:, 5:7].copy(),
     )
-    return _in_itrf(found, table.declared, epoch, fail)
+    return _in_itrf(found, table.declared, epoch)
 
 
-def _in_itrf(points: ControlPoints, declared: dict[str, str], epoch: Epoch, fail) -> ControlPoints:
+def _in_itrf(points: ControlPoints, declared: dict[str, str], epoch: Epoch) -> ControlPoints:
     """The points at an epoch in ITRF2020, where their file declares a frame or an epoch."""
     remedy = "write it as in '# frame: EPSG:6318' or '# epoch: 2016.4', or leave it out"
     try:
         system = CRS.from_user_input(declared.get("frame") or "EPSG:4979")
         own = epoch_year(declared.get("epoch", ""))
     except CRSError as error:
-        raise fail(f"its frame {declared['frame']!r} cannot be used ({error})", remedy) from None
+        raise InputError(
+            f"its frame {declared['frame']!r} cannot be used ({error})", remedy=remedy
+        ) from None
     except ValueError as error:
-        raise fail(f"its epoch {declared['epoch']!r} {error}", remedy) from None
+        raise InputError(f"its epoch {declared['epoch']!r} {error}", remedy=remedy) from None
     if not system.is_geographic:
-        raise fail(
+        raise InputError(
             f"its frame '{system.name}' is no geographic system",
-            "name that of its longitudes and latitudes, as EPSG:6318 of NAD83(2011)",
+            remedy="name that of its longitudes and latitudes, as EPSG:6318 of NAD83(2011)",
         )
     place = float(np.median(points.lon)), float(np.median(points.lat))
-    try:
-        change = frame_change(system, place, epoch, own)
-    except InputError as error:
-        raise fail(error.problem, error.remedy) from None
+    change = frame_change(system, place, epoch, own)
     if change is None:
         record = taken_as_it_is(system, epoch)
         if record["source"]["epoch"] is None:
-            raise fail(
+            raise InputError(
                 f"how its frame '{system.name}' gets to ITRF2020 is not known to centimetres",
-                "transform the points to ITRF2020 by the country's own service",
+                remedy="transform the points to ITRF2020 by the country's own service",
             )
         return replace(points, frame=record)
     lon, lat, height = change(points.lon, points.lat, points.height)
@@ -194,13 +196,13 @@ def images_measured(file: str | Path) -> dict[str, int]:
 
 
 def _as_pair(
-    rows: list[tuple[int, dict[str, str]]], images: tuple[str, str] | None, fail
+    rows: list[tuple[int, dict[str, str]]], images: tuple[str, str] | None
 ) -> list[tuple[int, dict[str, str]]]:
     """Lines of the long form as those of a pair: one for each point that either image shows."""
     if images is None or not all(images):
-        raise fail(
+        raise InputError(
             "control points by image (column image), and the scene's images have no names",
-            "list both images in the images sheet (key images), or write the form of a pair: "
+            remedy="list both images in the images sheet (key images), or write a pair's form: "
             f"{','.join(COLUMNS)}",
         )
     views = dict(zip(images, ("left", "right")))
@@ -210,9 +212,9 @@ def _as_pair(
         name, place = cells["id"], [cells[column] for column in ("lon", "lat", "height")]
         before, there = ground.setdefault(name, (line, place))
         if there != place:
-            raise fail(
+            raise InputError(
                 f"lines {before} and {line}: point {name} has two places on the ground",
-                "give all lines of a point the same lon, lat and height",
+                remedy="give all lines of a point the same lon, lat and height",
             )
         view = views.get(of_text(cells["image"]))
         if view is None:
@@ -220,28 +222,27 @@ def _as_pair(
         empty = dict.fromkeys(COLUMNS[4:], "")
         of_pair = found.setdefault(name, (line, {**dict(zip(COLUMNS, (name, *place))), **empty}))
         if of_pair[1][f"{view}_col"]:
-            raise fail(
+            raise InputError(
                 f"lines {of_pair[0]} and {line}: point {name} is measured twice in image "
                 f"{cells['image']}",
-                "keep one of the two lines",
+                remedy="keep one of the two lines",
             )
         for axis in ("col", "row"):
             if not cells[axis]:
-                raise fail(
+                raise InputError(
                     f"line {line}, point {name}: {axis} is empty",
-                    "give the point's position in the image, or remove the line",
+                    remedy="give the point's position in the image, or remove the line",
                 )
             of_pair[1][f"{view}_{axis}"] = cells[axis]
     if not found:
-        raise fail(
+        raise NoPoints(
             f"no point is measured in {images[0]} or {images[1]}",
-            "measure some, or leave column gcps empty",
-            NoPoints,
+            remedy="measure some, or leave column gcps empty",
         )
     return list(found.values())
 
 
-def _refuse_copies(points: dict[str, tuple[int, list[float]]], fail) -> None:
+def _refuse_copies(points: dict[str, tuple[int, list[float]]]) -> None:
     """A point under two ids would count twice: the same ground and the same place in a view."""
     seen: dict[tuple, str] = {}
     for name, (line, values) in points.items():
@@ -250,10 +251,10 @@ def _refuse_copies(points: dict[str, tuple[int, list[float]]], fail) -> None:
                 continue
             first = seen.setdefault((view, *values[:3], *values[view : view + 2]), name)
             if first != name:
-                raise fail(
+                raise InputError(
                     f"lines {points[first][0]} and {line} are one point under two ids, {first} "
                     f"and {name}",
-                    "keep one of the two lines",
+                    remedy="keep one of the two lines",
                 )
 
 
@@ -273,7 +274,7 @@ def _table(file: Path) -> Table:
     return table
 
 
-def _values(name: str, line: int, cells: dict[str, str], fail) -> list[float]:
+def _values(name: str, line: int, cells: dict[str, str]) -> list[float]:
     """The seven numbers of a point, checked; NaN for empty image coordinates."""
     values = []
     for column in COLUMNS[1:]:
@@ -287,31 +288,35 @@ def _values(name: str, line: int, cells: dict[str, str], fail) -> list[float]:
             number = np.nan
         if not np.isfinite(number):
             what = "is empty" if not text else f"{text[:40]!r} is no number"
-            raise fail(f"line {line}, point {name}: {column} {what}", "write a decimal number")
+            raise InputError(
+                f"line {line}, point {name}: {column} {what}", remedy="write a decimal number"
+            )
         values.append(number)
     lon, lat, height, *image = values
     if abs(lat) > 90 or not -180 <= lon <= 360:
         where = f"line {line}, point {name}: lon {lon:g}, lat {lat:g}"
         if abs(lon) <= 90 and abs(lat) <= 360:
-            raise fail(f"{where}: lon and lat seem to be swapped", "exchange the two columns")
-        raise fail(
+            raise InputError(
+                f"{where}: lon and lat seem to be swapped", remedy="exchange the two columns"
+            )
+        raise InputError(
             f"{where} are no degrees",
-            "give WGS 84 longitude and latitude in degrees, not projected coordinates",
+            remedy="give WGS 84 longitude and latitude in degrees, not projected coordinates",
         )
     if not HEIGHT_RANGE[0] <= height <= HEIGHT_RANGE[1]:
-        raise fail(
+        raise InputError(
             f"line {line}, point {name}: a height of {height:g} m is not of this Earth",
-            "give ellipsoidal heights in metres",
+            remedy="give ellipsoidal heights in metres",
         )
     for view, pair in (("left", image[:2]), ("right", image[2:])):
         if np.isnan(pair[0]) != np.isnan(pair[1]):
-            raise fail(
+            raise InputError(
                 f"line {line}, point {name}: only one of {view}_col, {view}_row is given",
-                "give both, or leave both empty where the image does not show the point",
+                remedy="give both, or leave both empty where the image does not show the point",
             )
     if np.isnan(image).all():
-        raise fail(
+        raise InputError(
             f"line {line}, point {name} is measured in neither image",
-            "give its position in at least one image, or remove it",
+            remedy="give its position in at least one image, or remove it",
         )
     return values

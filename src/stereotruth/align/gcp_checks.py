@@ -1,30 +1,42 @@
-"""What is refused of ground control points before and after the fit, naming file and remedy."""
+"""Which ground control points are blunders, and what is refused of them before and after the fit.
+
+Robust least squares of small corrections in image space: affine, similarity or shift. Blunders are
+found by least trimmed squares over all minimal samples (Rousseeuw & Van Driessen 2006, "Computing
+LTS regression for large data sets"), then by studentised residuals; the result is the exact
+least-squares solution (by ``cv2.solve``) on the other points. ``cv2.estimateAffine2D``, the paper's
+way, draws random samples and refines its result only in part, so that it depends on the order of
+the points. What is refused names the remedy, and the file if it is not that of the points.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import cv2
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
-from pyproj.exceptions import ProjError
-from rasterio.errors import RasterioError
 
 from ..core.errors import InputError, in_number
-from ..core.numerics.geometry import metres_per_degree, turn
-from ..core.products.rasters import open_raster
+from ..sensor.pair_geometry import GroundOfImages
 from ..sensor.rpc import SensorModel
-from ..sensor.rpc_files import read_rpc, rpc_file
+from ..sensor.rpc_files import rpc_file
 from .control_points import ControlPoints, TooFewPoints
-from .robust_fit import MINIMAL, System
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
 
 
+MINIMAL = {"affine": 3, "similarity": 2, "shift": 1}  # points that determine the model
+BLUNDER_FLOOR = 1.25  # px: 5 sigma of a careful measurement (0.25 px)
+BLUNDER_SIGMAS = 4.5  # of a Rayleigh distributed length: a good point in 25 000 is beyond
+RAYLEIGH_MEDIAN = 1.1774  # median length of a 2-D Gaussian vector of unit sigma
+PRIOR_NOISE = 0.5  # px of a measurement, and
+PRIOR_TILT = (1.0, 0.0005)  # px plus share of the extent that RPCs may be tilted: for ties only
+MAX_SAMPLES = 2000  # minimal samples tried: all of them up to 23 GCPs
 # One more than determines the model is asked for: with fewer, no residual tells of an error.
 NEEDED = {model: n + 1 for model, n in MINIMAL.items()}
 MAX_LEFT_OUT = 1 / 3  # share of blunders beyond which nobody knows which points are right
@@ -33,11 +45,160 @@ UNCHECKED_SIGMA = 3.0  # px, where there are too few GCPs to find the blunder am
 MAX_TILT = 0.05  # beyond, columns and rows are mixed up
 MIN_SPREAD = 10.0  # px: standard deviation of the GCPs along their main axis
 MIN_WIDTH_RATIO = 0.05  # of the deviations across and along: below, the GCPs count as collinear
-PIXEL_M = (0.01, 1000.0)  # m on the ground
-PIXEL_RATIO = 2.0  # of the largest and smallest in an image, over the heights of its RPC
-GRID_SHIFT_M = 100.0  # between an image's map grid and its RPC: rounded corners and a loose RPC
-GRID_BENT = 0.01  # of the image's diagonal likewise, without the shift
 FRAME_MARGIN = 1.0  # px that a measurement may lie outside the pixels of the image
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """Linear system of a view: measured − predicted [n, 2] = design [n, 2, p] @ parameters [p].
+
+    ``embed`` float64[6, p] takes the parameters to those of the affine in normalised coordinates.
+    """
+
+    design: Floats
+    delta: Floats
+    embed: Floats
+    origin: Floats
+    scale: float
+    minimal: int
+
+    @classmethod
+    def of(cls, model: str, predicted: Floats, measured: Floats) -> System:
+        """The system of a model for projected and measured (col, row) [n, 2] px."""
+        # Normalised by the measurements: they lie inside the image, whatever is predicted.
+        origin = np.median(measured, axis=0)
+        scale = max(float(np.ptp(measured, axis=0).max()) / 2, 1.0)
+        if model == "affine":
+            embed = np.eye(6)
+        elif model == "similarity":
+            embed = np.zeros((6, 4))
+            embed[[0, 4], 0] = 1.0  # change of scale
+            embed[[1, 3], 1] = -1.0, 1.0  # rotation
+            embed[2, 2] = embed[5, 3] = 1.0
+        else:
+            embed = np.zeros((6, 2))
+            embed[2, 0] = embed[5, 1] = 1.0
+        u = (predicted - origin) / scale
+        basis = np.column_stack([u, np.ones(len(u))])
+        full = np.zeros((len(u), 2, 6))
+        full[:, 0, :3] = full[:, 1, 3:] = basis
+        return cls(full @ embed, measured - predicted, embed, origin, scale, MINIMAL[model])
+
+    def solve(self, used: Bools) -> Floats:
+        """Exact least squares on the used points."""
+        design = np.ascontiguousarray(self.design[used].reshape(-1, self.design.shape[2]))
+        good, parameters = cv2.solve(
+            design, self.delta[used].reshape(-1, 1).copy(), flags=cv2.DECOMP_SVD
+        )
+        assert good
+        return parameters[:, 0]
+
+    def residuals(self, parameters: Floats) -> Floats:
+        """[n, 2] px, measured minus corrected."""
+        return self.delta - self.design @ parameters
+
+    def cofactors(self, used: Bools) -> Floats:
+        """[p, p]: inverse of the normal matrix of the used points."""
+        design = self.design[used].reshape(-1, self.design.shape[2])
+        return np.linalg.pinv(design.T @ design)
+
+    def leverages(self, used: Bools) -> Floats:
+        """[n, 2, 2]: cofactors of the corrections at all points."""
+        q = self.cofactors(used)
+        return np.einsum("nap,pq,nbq->nab", self.design, q, self.design)
+
+    def affine(self, parameters: Floats) -> Floats:
+        """float64[2, 3] for (col, row, 1) of the RPC."""
+        normalised = (self.embed @ parameters).reshape(2, 3)
+        linear = normalised[:, :2] / self.scale
+        shift = normalised[:, 2] - linear @ self.origin
+        return np.column_stack([np.eye(2) + linear, shift])
+
+
+def trimmed(system: System, seed: int) -> Bools:
+    """The half of the points (and a little more) that agree best: least trimmed squares.
+
+    Each minimal sample starts concentration steps: fit, keep the h points that fit best, repeat.
+    Up to n − h blunders do no harm: 6 of 15 points for an affine, 1 of 5, none of 4. Among few
+    points a sample with a blunder may fit as well as the good one, by a correction that no RPC
+    needs: that is held against it (5 random points, one 20 px off, 0.25 px noise: the blunder alone
+    is left out in 99 % of the cases, 96 % without).
+    """
+    n, k = len(system.delta), system.minimal
+    h = (n + k + 1) // 2
+    if math.comb(n, k) <= MAX_SAMPLES:
+        samples = np.array(list(itertools.combinations(range(n), k)))
+    else:
+        rng = np.random.default_rng(seed)
+        samples = np.array([rng.choice(n, k, replace=False) for _ in range(MAX_SAMPLES)])
+    kept = np.zeros((len(samples), n))
+    np.put_along_axis(kept, samples, 1.0, axis=1)
+    normal = np.einsum("nap,naq->npq", system.design, system.design)
+    right = np.einsum("nap,na->np", system.design, system.delta)
+    p = normal.shape[1]
+    for _ in range(20):
+        matrix = (kept @ normal.reshape(n, -1)).reshape(-1, p, p)
+        ridge = 1e-12 * np.trace(matrix, axis1=1, axis2=2)  # samples on one line or one spot
+        matrix = matrix + ridge[:, None, None] * np.eye(p)
+        parameters = np.linalg.solve(matrix, (kept @ right)[:, :, None])[:, :, 0]
+        misfit = system.delta - np.einsum("nap,kp->kna", system.design, parameters)
+        squares = np.sum(misfit**2, axis=2)
+        best = np.argsort(squares, axis=1, kind="stable")[:, :h]
+        again = np.zeros_like(kept)
+        np.put_along_axis(again, best, 1.0, axis=1)
+        if (again == kept).all():
+            break
+        kept = again
+    tilt = (parameters @ system.embed.T)[:, [0, 1, 3, 4]]
+    allowed = PRIOR_TILT[0] + PRIOR_TILT[1] * system.scale
+    cost = np.take_along_axis(squares, best, axis=1).sum(axis=1) / PRIOR_NOISE**2
+    cost += np.square(tilt / allowed).sum(axis=1)
+    return kept[np.argmin(cost)] > 0
+
+
+def studentised(system: System, used: Bools) -> Floats:
+    """[n] lengths in px of the residuals, brought to the deviation of a measurement.
+
+    A residual of a used point varies by 1 − leverage of the measurement's variance, that of
+    another point by 1 + leverage. So a good point far from the others is not taken for a blunder.
+    """
+    lengths = np.hypot(*system.residuals(system.solve(used)).T)
+    leverage = np.trace(system.leverages(used), axis1=1, axis2=2) / 2
+    variance = np.where(used, 1 - leverage, 1 + leverage)
+    return lengths / np.sqrt(np.maximum(variance, 1e-6))
+
+
+def find_blunders(system: System, *, floor: float, seed: int) -> tuple[Bools, Floats, float]:
+    """Which points are used, the studentised residuals [n] in px, and the threshold in px."""
+    n = len(system.delta)
+    if n <= system.minimal + 1:  # nothing to tell a blunder from the others
+        used = np.ones(n, dtype=bool)
+        return used, np.zeros(n), np.inf
+    used = trimmed(system, seed)
+    for _ in range(30):
+        lengths = studentised(system, used)
+        sigma = float(np.median(lengths)) / RAYLEIGH_MEDIAN
+        # Wider for few points, whose deviation is not well known (as Student's t is).
+        threshold = (1 + 1 / (n - system.minimal)) * max(floor, BLUNDER_SIGMAS * sigma)
+        again = lengths <= threshold
+        if again.sum() <= system.minimal or (again == used).all():
+            break
+        used = again
+    return used, lengths, threshold
+
+
+def leave_one_out_residuals(system: System, used: Bools) -> Floats:
+    """[n, 2] residuals px of every point by the fit without it, in closed form.
+
+    For a used point (I − H)⁻¹ r, H its 2 × 2 leverage; NaN where the others leave it undetermined.
+    """
+    residuals = system.residuals(system.solve(used))
+    left = np.eye(2) - system.leverages(used)
+    out = residuals.copy()
+    for i in np.flatnonzero(used):
+        determined = np.linalg.eigvalsh(left[i])[0] > 1e-9
+        out[i] = np.linalg.solve(left[i], residuals[i]) if determined else np.nan
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,111 +257,12 @@ def _remedy(model: str, points: Floats) -> str:
     return f"{more}, or set alignment.model to {names}, which these GCPs can carry"
 
 
-def open_view(name: str, image: Path, of: str) -> tuple[SensorModel, tuple[int, int]]:
-    """The RPC of an image and its size (cols, rows).
-
-    Raises InputError: unreadable, or an RPC that does not see the ground by the image's pixels.
-    """
-    sensor = SensorModel(read_rpc(image))
-    try:
-        with open_raster(image) as dataset:
-            size = dataset.width, dataset.height
-            apart = _apart_of_grid(dataset, sensor)
-    except RasterioError as error:
-        raise InputError(
-            f"cannot be opened as the {name} image{of} ({error})",
-            file=image,
-            remedy="check the file",
-        ) from None
-    if apart:
-        raise InputError(
-            f"the {name} image {image.name} is on a map grid and has an RPC, which put its pixels "
-            f"{apart:.0f} m apart: it was map-projected, or cut, and kept the RPC from before{of}",
-            file=image,
-            remedy="give the image as the sensor saw it, with its RPC; if it is that, take the "
-            "grid away (gdal_edit.py -unsetgt -a_srs '')",
-        )
-    if defect := _blindness(sensor, size):
-        raise InputError(
-            f"the RPC of the {name} image {image.name} cannot be right: {defect}{of}",
-            file=rpc_file(image),
-            remedy="check that RPC and image belong together, and get the RPC again from the "
-            "image's supplier",
-        )
-    return sensor, size
-
-
-def _apart_of_grid(dataset: Any, sensor: SensorModel) -> float:
-    """Metres by which an image's map grid and its RPC contradict each other; 0 if they do not.
-
-    Images that were projected to a plane (ortho-ready) have RPCs of their own, which agree with the
-    grid at one height. Corners of NITF are rounded to a second of arc: GRID_SHIFT_M is allowed.
-    """
-    if dataset.crs is None or dataset.transform == dataset.transform.identity():
-        return 0.0
-    try:
-        to_degrees = pyproj.Transformer.from_crs(dataset.crs.to_wkt(), 4326, always_xy=True)
-    except ProjError:
-        return 0.0
-    axes = (np.linspace(0, n - 1, 5) for n in (dataset.width, dataset.height))
-    col, row = (v.ravel() for v in np.meshgrid(*axes))
-    lon, lat = to_degrees.transform(*(dataset.transform * (col + 0.5, row + 0.5)))
-    best = np.inf, np.inf
-    for share in np.linspace(-1.0, 1.0, 21):
-        height = sensor.rpc.height_off + share * sensor.rpc.height_scale
-        at = np.array(sensor.localize(col, row, height)) - (lon, lat)
-        east, north = np.stack([turn(at[0]), at[1]]) * metres_per_degree(lat)
-        whole = np.hypot(east, north)
-        bent = np.hypot(east - east.mean(), north - north.mean())
-        if np.isfinite(whole).all():
-            best = min(best, (float(np.sqrt(np.mean(whole**2))), float(np.sqrt(np.mean(bent**2)))))
-    east, north = (np.ptp(v) for v in np.array([lon, lat]) * metres_per_degree(lat))
-    is_other = best[0] > GRID_SHIFT_M or best[1] > GRID_BENT * np.hypot(east, north)
-    return best[0] if is_other and np.isfinite(best[0]) else 0.0
-
-
-def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
-    """Why an RPC cannot be that of an image of this size, or an empty string."""
-    rpc = sensor.rpc
-    cols, rows = (np.linspace(0, n - 1, 3) for n in size)
-    heights = rpc.height_off + rpc.height_scale * np.array([0.0, -1.0, 1.0])
-    height, row, col = (a.reshape(3, 9) for a in np.meshgrid(heights, rows, cols, indexing="ij"))
-    lon, lat = sensor.localize(col, row, height)
-    if not np.isfinite([lon[0], lat[0]]).all():
-        return "lines of sight through its middle and corners do not meet the ground"
-    sides = []
-    for step in ((1.0, 0.0), (0.0, 1.0)):
-        there = np.array(sensor.localize(col + step[0], row + step[1], height)) - (lon, lat)
-        side = np.hypot(*(there * metres_per_degree(lat)))
-        sides.append(side[np.isfinite(side)])
-        if not (PIXEL_M[0] <= sides[-1].min() and sides[-1].max() <= PIXEL_M[1]):
-            return f"its pixels would be {sides[-1].min():.3g} to {sides[-1].max():.3g} m long"
-        if sides[-1].max() > PIXEL_RATIO * sides[-1].min():
-            return (
-                f"its pixels would be {sides[-1].min():.3g} m long here and "
-                f"{sides[-1].max():.3g} m there"
-            )
-    west, south, east, north, low, high = rpc.ground_box
-    axes = (np.linspace(*ends, 5) for ends in ((west, east), (south, north), (low, high)))
-    terms = rpc.denominators(*(axis.reshape(-1) for axis in np.meshgrid(*axes)))
-    if (terms.min(axis=1) * terms.max(axis=1) <= 0).any():
-        return "a denominator vanishes within its own ground box"
-    return ""
-
-
 def footprint(sensor: SensorModel, size: tuple[int, int]) -> Floats:
     """(lon_min, lat_min, lon_max, lat_max) of an image over its RPC's heights, widened by half."""
-    heights = np.array([-1.0, 0.0, 1.0]) * abs(sensor.rpc.height_scale) + sensor.rpc.height_off
-    col, row, height = np.meshgrid([0, size[0] - 1], [0, size[1] - 1], heights)
-    lon, lat = sensor.localize(col, row, height)
-    if not np.isfinite(lon).any():
-        box = sensor.rpc.ground_box
-        low, high = np.array(box[:2]), np.array(box[2:4])
-    else:
-        low = np.array([np.nanmin(lon), np.nanmin(lat)])
-        high = np.array([np.nanmax(lon), np.nanmax(lat)])
-    margin = (high - low) / 2 + 0.01
-    return np.concatenate([low - margin, high + margin])
+    middle, half = sensor.rpc.height_off, abs(sensor.rpc.height_scale)
+    box = np.array(GroundOfImages([sensor], [size]).box((middle - half, middle + half)))
+    margin = (box[2:] - box[:2]) / 2 + 0.01
+    return box + np.concatenate([-margin, margin])
 
 
 def _in_box(box: Floats, lon: Floats, lat: Floats) -> Bools:
@@ -209,9 +271,7 @@ def _in_box(box: Floats, lon: Floats, lat: Floats) -> Bools:
     return (lon >= box[0]) & (lon <= box[2]) & (lat >= box[1]) & (lat <= box[3])
 
 
-def check_ground(
-    points: ControlPoints, boxes: Sequence[Floats], images: Sequence[Path], of: str
-) -> Bools:
+def check_ground(points: ControlPoints, boxes: Sequence[Floats], images: Sequence[Path]) -> Bools:
     """bool[n]: near either image's footprint (``boxes``, left and right).
 
     Refuses the file if most points are elsewhere, an RPC if it is alone with its ground.
@@ -227,7 +287,7 @@ def check_ground(
         box = boxes[wrong]
         raise InputError(
             f"this RPC leads to ground about lon {(box[0] + box[2]) / 2:.4f}, lat "
-            f"{(box[1] + box[3]) / 2:.4f}; the other image and the GCPs are elsewhere{of}",
+            f"{(box[1] + box[3]) / 2:.4f}; the other image and the GCPs are elsewhere",
             file=rpc_file(images[wrong]),
             remedy="check that RPC and image belong together, and the image to this scene",
         )
@@ -242,13 +302,11 @@ def check_ground(
     )
     if 2 * swapped.sum() > len(near):
         raise InputError(
-            f"lon and lat of the GCPs seem to be swapped: {where}{of}",
-            file=points.file,
+            f"lon and lat of the GCPs seem to be swapped: {where}",
             remedy="exchange the columns lon and lat",
         )
     raise InputError(
-        f"the GCPs lie far from the ground that the images show: {where}{of}",
-        file=points.file,
+        f"the GCPs lie far from the ground that the images show: {where}",
         remedy="check that the file is that of this scene, and its coordinates WGS 84 degrees",
     )
 
@@ -268,7 +326,7 @@ def check_heights(points: ControlPoints, sensor: SensorModel) -> str:
 
 
 def misfits_of_sides(
-    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools | None = None
+    points: ControlPoints, sensors: Sequence[SensorModel], near: Bools | None = None
 ) -> tuple[float, float]:
     """How far GCPs miss a pair as it is given, and with both images exchanged, px.
 
@@ -298,22 +356,19 @@ def fit_exchanged(given: float, exchanged: float) -> bool:
     return given > 10.0 and exchanged < given / 5
 
 
-def check_swapped(
-    points: ControlPoints, sensors: tuple[SensorModel, SensorModel], near: Bools, of: str
-) -> None:
+def check_swapped(points: ControlPoints, sensors: Sequence[SensorModel], near: Bools) -> None:
     """Refuse a pair whose GCPs fit only with left and right exchanged."""
     given, exchanged = misfits_of_sides(points, sensors, near)
     if fit_exchanged(given, exchanged):
         raise InputError(
             "left_image and right_image seem to be swapped in the scenes sheet: the GCPs miss by "
-            f"{given:.0f} px as given, by {exchanged:.1f} px with the two exchanged{of}",
-            file=points.file,
+            f"{given:.0f} px as given, by {exchanged:.1f} px with the two exchanged",
             remedy="exchange the columns left_image and right_image of this scene; left is the "
             "backward view (or exchange the left and right columns of the GCP file, if it is that)",
         )
 
 
-def check_frame(points: ControlPoints, view: View, of: str) -> None:
+def check_frame(points: ControlPoints, view: View) -> None:
     """Refuse measurements outside the image."""
     limit = np.array(view.size) - 0.5 + FRAME_MARGIN
     outside = ~((view.measured >= -0.5 - FRAME_MARGIN) & (view.measured <= limit)).all(axis=1)
@@ -325,8 +380,7 @@ def check_frame(points: ControlPoints, view: View, of: str) -> None:
         raise InputError(
             f"GCP {name} (line {points.line[view.index[first]]}) is measured at col {col:.1f}, row "
             f"{row:.1f}, outside the {view.name} image {view.image.name} of {view.size[0]} x "
-            f"{view.size[1]} px (cols x rows)" + (f", and {others} more" if others else "") + of,
-            file=points.file,
+            f"{view.size[1]} px (cols x rows)" + (f", and {others} more" if others else ""),
             remedy="correct the measurement, or leave both cells empty where the image does not "
             "show the point",
         )
@@ -339,7 +393,7 @@ def _where(view: View) -> str:
     return f"{view.name} image {view.image.name}{beside}"
 
 
-def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: str) -> None:
+def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools) -> None:
     """Refuse a view whose used GCPs cannot carry the model."""
     defect = _defect(model, view.predicted[used])
     if not defect:
@@ -347,14 +401,13 @@ def refuse_fit(model: str, view: View, points: ControlPoints, used: Bools, of: s
     out = [points.ids[i] for i in view.index[~used]]
     rest = f" after {_some(out)} were left out" if out else ""
     raise TooFewPoints(
-        f"{_where(view)}: {defect}{rest}{of}",
-        file=points.file,
+        f"{_where(view)}: {defect}{rest}",
         remedy=_remedy(model, view.predicted[used]),
     )
 
 
 def refuse_misfit(
-    model: str, view: View, system: System, points: ControlPoints, used: Bools, of: str
+    model: str, view: View, system: System, points: ControlPoints, used: Bools
 ) -> float:
     """Refuse GCPs that contradict each other; sigma0 in px of those used."""
     n, kept = len(used), int(used.sum())
@@ -365,8 +418,7 @@ def refuse_misfit(
     if n - kept > MAX_LEFT_OUT * n:
         out = [points.ids[i] for i in view.index[~used]]
         raise InputError(
-            f"{where}: {len(out)} of {n} GCPs contradict the others ({_some(out)}){of}",
-            file=points.file,
+            f"{where}: {len(out)} of {n} GCPs contradict the others ({_some(out)})",
             remedy="check these GCPs, and that the file belongs to these images and their RPCs",
         )
     if n <= system.minimal + 2 and sigma > UNCHECKED_SIGMA:
@@ -375,23 +427,20 @@ def refuse_misfit(
         suspect = points.ids[view.index[int(np.argmax(far))]]
         raise InputError(
             f"{where}: the {n} GCPs contradict each other by {sigma:.1f} px, and so few do not "
-            f"tell which is wrong ({suspect} differs most from the others' shift){of}",
-            file=points.file,
+            f"tell which is wrong ({suspect} differs most from the others' shift)",
             remedy=f"check {suspect} first; measure more GCPs: among "
             f"{system.minimal + 3} or more a blunder is found and left out",
         )
     if sigma > MAX_SIGMA:
         raise InputError(
             f"{where}: the GCPs do not fit the image (sigma {sigma:.1f} px after the {model} "
-            f"correction){of}",
-            file=points.file,
+            f"correction)",
             remedy="check that GCP file, image and RPC belong together, and that heights are "
             "metres above the ellipsoid",
         )
     if (change := tilt(system.affine(system.solve(used)))) > MAX_TILT:
         raise InputError(
-            f"{where}: the GCPs ask for a change of scale or angle by {100 * change:.0f} %{of}",
-            file=points.file,
+            f"{where}: the GCPs ask for a change of scale or angle by {100 * change:.0f} %",
             remedy="check that columns count from the left and rows from the top, and that GCP "
             "file, image and RPC belong together",
         )

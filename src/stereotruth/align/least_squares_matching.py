@@ -104,7 +104,8 @@ def _shift(
 def warp_patch(
     source: Picture, col: float, row: float, carry: Floats, scale: tuple[float, float], out: Picture
 ) -> None:
-    """Fill ``out`` [odd, odd] by the source at (col, row) + carry · (offset from the middle)."""
+    """Fill ``out`` [h, w] by the source at (col, row) + carry · (columns, rows from the pixel
+    [h // 2, w // 2]), by cubic convolution."""
     across = np.empty(2 * int(np.ceil(SIX_POINT_RADIUS * scale[0])))
     down = np.empty(2 * int(np.ceil(SIX_POINT_RADIUS * scale[1])))
     half_rows, half_cols = out.shape[0] // 2, out.shape[1] // 2

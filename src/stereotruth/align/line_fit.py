@@ -33,8 +33,8 @@ from .adjustment import (
     estimate,
     root_of,
 )
-from .equations import Equations
-from .hill_climb import WIDEST, Steps, amount, climb
+from .records import Equations
+from .shared_errors import WIDEST, Steps, amount, climb
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -317,11 +317,6 @@ def _freedom(covariance: Floats, variances: Floats) -> float:
     return float(known.sum() - np.sum(np.diag(covariance)[known] / variances[known]))
 
 
-def _scaled(equations: Equations, expected: Floats) -> tuple[Floats, Floats]:
-    """Design and observations in units of the matches' own standard deviations [n]."""
-    return equations.design / expected[:, None, None], equations.observed / expected[:, None]
-
-
 def fit_lines(
     equations: Equations,
     affine_root: Floats,
@@ -336,7 +331,8 @@ def fit_lines(
     """
     used = weights > 0.0
     equations, expected, weights = equations.part(used), expected[used], weights[used]
-    design, observed = _scaled(equations, expected)
+    design = equations.design / expected[:, None, None]  # in deviations of the matches
+    observed = equations.observed / expected[:, None]
     of_affine = design @ affine_root
     of_lines = line_design(design, equations.lines, rows)
     sites = np.unique(equations.site, return_inverse=True)[1]
@@ -349,8 +345,9 @@ def fit_lines(
     )
     length, steps, gain = _likeliest(every, free)
     root = process(length)
-    both = np.concatenate([of_affine, _reduced(of_lines, root) * unit], axis=-1)
-    variances = _variances(free, steps[:2], root.shape[1])
+    parts = [part @ root * unit for part in np.split(of_lines, 4, axis=-1)]
+    both = np.concatenate([of_affine, *parts], axis=-1)
+    variances = _variances(free, steps, root.shape[1])
     sums = every.reduced(affine, root)
     found = _posterior(sums, amount(steps[2]), variances)
     halves = _Halves.of(
@@ -395,7 +392,7 @@ def _likeliest(every: _Sums, free: Floats) -> tuple[float, Steps, float]:
             continue
 
         def score(steps: Steps, sums: _Sums = sums, rank: int = root.shape[1]) -> float:
-            variances = _variances(free, steps[:2], rank)
+            variances = _variances(free, steps, rank)
             return _posterior(sums, amount(steps[2]), variances).twice_log
 
         start, top = climb(score, start)
@@ -427,16 +424,10 @@ def _clearness(sums: _Sums, of_site: float, free: Floats) -> float:
     return found
 
 
-def _reduced(of_lines: Floats, root: Floats) -> Floats:
-    """[n, 2, 4 r]: a design of coefficients as one of the processes' own unknowns."""
-    parts = np.split(of_lines, 4, axis=-1)
-    return np.concatenate([part @ root for part in parts], axis=-1)
-
-
 def _variances(free: Floats, steps: Steps, rank: int) -> Floats:
     """Prior variances of the affine's unknowns and those of the processes, in the noise's."""
-    along, across = (amount(k) ** 2 for k in steps)
-    return np.concatenate([free, *(np.full(rank, v) for v in (along, across, along, across))])
+    own = np.repeat([amount(k) ** 2 for k in steps[:2]], rank)
+    return np.concatenate([free, own, own])
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ both images have in common they see on slopes only, as LiDAR strips are co-regis
 heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
 settle the relative part, and the rest as far as they see it. Where that leaves the place in plan
-open, edges of roofs settle it (:mod:`.plan_place`).
+open, edges of roofs settle it (:mod:`.shared_errors`).
 
 The adjustment starts from what most tie points agree on, and blunders (moved or built since,
 vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
@@ -26,11 +26,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from ..core.config.configuration import Rectify
 from ..core.errors import InputError
 from ..core.numerics.statistics import robust_sigma
+from ..core.products.files import write_table
 from ..lidar.point_store import PointStore, open_stores
 from ..sensor.images import Source, open_pair
 from .adjustment import (
@@ -41,16 +41,14 @@ from .adjustment import (
     epipolar_model,
     linearised_at,
     pair_equations,
-    prior_of,
     pull_of,
-    with_corrections,
 )
 from .align import PLACES_BY_RPCS
-from .aligned_pair import Alignment, ViewFit
-from .equations import Equations, spread_of
-from .lack_of_fit import SharedErrors, with_shared_errors
-from .lidar_checks import (
+from .alignment import Alignment, ViewFit, prior_of, with_corrections
+from .doubts import (
+    MIN_USED,
     HeightOffset,
+    LabelSigma,
     chance_of_contradiction,
     control_points_of,
     doubt_at_gcps,
@@ -59,14 +57,15 @@ from .lidar_checks import (
     height_by_rpcs,
     heights_of_model,
     pixel_m,
+    remark_of,
     scatter_by_heights,
 )
+from .images import choose_sites
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
-from .misfit_causes import LabelSigma, remark_of
-from .plan_place import place_pair
-from .tie_points import Geometry, common_shift, match
-from .tie_sites import choose_sites, find_places
+from .records import Equations, spread_of
+from .shared_errors import SharedErrors, place_pair, with_shared_errors
+from .tie_points import Geometry, common_shift, find_places, match
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -81,9 +80,12 @@ SETTLED = 0.01  # px, change of a round after which no other follows
 MOVED = 3.0  # px in the left image after which places are looked for anew
 MIN_PLACES, MIN_SITES = 30, 8
 LOOSE = 0.5  # px: tie points that scatter more, or half of them blunders, tell nothing
-MIN_USED = 0.5
 DOUBTFUL = 1e-6  # probability of so large a change, by the GCPs' own scatter, that is worth a word
 SIGNIFICANT = 0.001  # probability of the change by chance, if the alignment were right
+HEIGHTS_BY_RPCS = (
+    "without ground control points a fault of the LiDAR's heights of less than {:.0f} m cannot be "
+    "told from errors of the RPCs"
+)
 
 
 def _changes(fit: ViewFit, affine: Floats) -> dict[str, float]:
@@ -101,13 +103,10 @@ def _changes(fit: ViewFit, affine: Floats) -> dict[str, float]:
 
 
 def _record(
-    alignment: Alignment,
-    refined: Alignment,
-    observations: Observations,
-    found: Estimate,
-    reason: str,
+    alignment: Alignment, result: _Found, reason: str, offset: HeightOffset, in_plan: dict[str, Any]
 ) -> dict[str, Any]:
     """JSON-ready figures of a refinement; ``reason`` why it was not applied, or empty."""
+    observations, found, refined = result.observations, result.estimate, result.alignment
     used, ties = observations.used, observations.ties
     size = alignment.left_fit.size
     spreads = {
@@ -125,7 +124,7 @@ def _record(
         "sites": int(np.unique(ties.site[used]).size),
         "chi_square": round(found.statistic, 2),
         "degrees_of_freedom": found.freedom,
-        "probability_by_chance": _chance(found),
+        "probability_by_chance": found.chance,
         "deviation_over_that_of_the_match": found.ratio.round(3).tolist(),
         "shared_in_a_site": found.site_ratio.round(3).tolist(),
         "sigma_shared_by_all_px": found.shared.round(4).tolist(),
@@ -135,12 +134,17 @@ def _record(
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
         "of the images, and y-parallax; changes in px of the original images over the whole image; "
         "lidar_height: m, of LiDAR minus images, and from what on a fault is told; place_in_plan: "
-        "m (east, north), see plan_place",
+        "m (east, north), by slopes and by edges of roofs",
+        "by_line": result.lines.figures(),
+        "shared_by_near_sites": result.shared.figures(),
+        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
+        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
+        "place_in_plan": in_plan,
+        "lidar_height": {name: round(value, 3) for name, value in vars(offset).items()},
+        "misfit_of_one_half_by_the_other": {
+            word: round(misfit, 3) for word, misfit in zip(("before", "after"), result.halves)
+        },
     }
-
-
-def _chance(found: Estimate) -> float:
-    return float(f"{chdtrc(found.freedom, found.statistic):.3g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,12 +161,6 @@ class _Found:
     sigma: LabelSigma
 
 
-HEIGHTS_BY_RPCS = (
-    "without ground control points a fault of the LiDAR's heights of less than {:.0f} m cannot be "
-    "told from errors of the RPCs"
-)
-
-
 def _search(
     alignment: Alignment,
     sources: tuple[Source, Source],
@@ -177,7 +175,8 @@ def _search(
     radius = FINE
     current = alignment
     for number in range(ROUNDS):
-        if places is None or _moved_left(alignment, parameters - found_at) > MOVED:
+        moved = alignment.left_fit.moved(parameters[:6] - found_at[:6])
+        if places is None or _changes(alignment.left_fit, moved)["largest"] > MOVED:
             height = alignment.reference_height
             sites = choose_sites(current.left, current.right, sizes, stores, height)
             if not sites:
@@ -304,7 +303,7 @@ def _widening(
     """What the covariance is multiplied by where there are doubts: which of two is wrong is not
     known, nor by how much (Birge's ratio). Adds a doubt to ``doubts`` where the ground may be
     another."""
-    ratio = max(found.contradiction / found.contradiction_freedom, 1.0) if doubts else 1.0
+    ratio = max(found.contradiction / found.freedom, 1.0) if doubts else 1.0
     if any(fit.gcps for fit in refined.fits):
         return ratio
     scatter, explained = scatter_by_heights(refined, *observations.after[observations.used].T)
@@ -319,11 +318,6 @@ def _widening(
     return max(ratio, (scatter / explained) ** 2)
 
 
-def _still_true(warnings: Sequence[str], unrefined: bool) -> list[str]:
-    """Warnings of the alignment before: once refined, places are known by the LiDAR."""
-    return [text for text in warnings if unrefined or text != PLACES_BY_RPCS]
-
-
 def _warn(doubts: Sequence[str], strict: bool, image: str | Path, of: str) -> None:
     for text in doubts:
         log.warning("warning: %s", text)
@@ -333,11 +327,6 @@ def _warn(doubts: Sequence[str], strict: bool, image: str | Path, of: str) -> No
             file=image,
             remedy="check LiDAR and GCPs, or set strict or alignment.refine to false",
         )
-
-
-def _moved_left(alignment: Alignment, parameters: Floats) -> float:
-    fit = alignment.left_fit
-    return _changes(fit, fit.moved(parameters[:6]))["largest"]
 
 
 def refine(
@@ -396,16 +385,11 @@ def refine(
         return unrefined, None
     observations, found, refined = result.observations, result.estimate, result.alignment
     reason = _objection(result, bool(gcps))
-    record = _record(alignment, refined, observations, found, reason)
-    record |= _misfits(result, reason)
     offset = (
         height_by_images(alignment, found) if gcps else height_by_rpcs(alignment, refined, found)
     )
-    record["place_in_plan"] = in_plan
-    record["lidar_height"] = {name: round(value, 3) for name, value in vars(offset).items()}
+    record = _record(alignment, result, reason, offset, in_plan)
     covariance = found.covariance
-    misfits = [round(misfit, 3) for misfit in result.halves]
-    record["misfit_of_one_half_by_the_other"] = dict(zip(("before", "after"), misfits))
     if reason:  # what is not applied adds to the uncertainty
         covariance = covariance + np.outer(found.parameters, found.parameters)
         refined = alignment
@@ -422,13 +406,15 @@ def refine(
     if not gcps and not doubts:
         doubts = [HEIGHTS_BY_RPCS.format(offset.told_from_m)]
         log.warning("warning: %s", *doubts)
+    # once refined, places are known by the LiDAR
+    told = [text for text in alignment.warnings if reason or text != PLACES_BY_RPCS]
     height = alignment.reference_height
     if not gcps:  # it was that of the RPCs, far off perhaps
         height = round(float(observations.ties.height[observations.used].mean()), 3)
     refined = replace(
         refined,
         reference_height=height,
-        warnings=(*_still_true(alignment.warnings, bool(reason)), *doubts),
+        warnings=(*told, *doubts),
         left_fit=replace(refined.left_fit, covariance=covariance[:6, :6]),
         right_fit=replace(refined.right_fit, covariance=covariance[6:, 6:]),
         cross_covariance=covariance[:6, 6:],
@@ -441,22 +427,12 @@ def refine(
     return refined, observations
 
 
-def _misfits(result: _Found, reason: str) -> dict[str, Any]:
-    """Of a record: what lines and near sites tell; ``reason`` as in :func:`_record`."""
-    return {
-        "by_line": result.lines.figures(),
-        "shared_by_near_sites": result.shared.figures(),
-        "remark": "" if reason else remark_of(result.sigma, result.lines, result.shared),
-        "sigma_of_labels_px": {k: round(v, 4) for k, v in vars(result.sigma).items()},
-    }
-
-
 def _objection(result: _Found, with_gcps: bool) -> str:
     """Why a refinement is not applied, or an empty string."""
     before, after = result.halves
     # what roofs tell of the place of both images, tie points need not contradict
     told = result.lines.stands_out or bool(result.observations.of_images.in_plan)
-    if _chance(result.estimate) > SIGNIFICANT and not told:
+    if result.estimate.chance > SIGNIFICANT and not told:
         return "the tie points do not contradict the alignment"
     if after >= before and with_gcps:
         return (
@@ -485,3 +461,29 @@ def _tell(record: Mapping[str, Any]) -> None:
         if record["applied"]
         else f"not applied: {record['reason']}",
     )
+
+
+def write_refinement(
+    alignment: Alignment,
+    observations: Observations | None,
+    json_file: str | Path,
+    csv_file: str | Path,
+) -> None:
+    """Write a refined alignment (JSON) and its tie points (CSV); without any the table is empty."""
+    places = [f"{view}_{axis}_px" for view in ("left", "right") for axis in ("col", "row")]
+    places += ["height_m", "epipolar_x_px", "epipolar_y_px"]
+    states = ("before", "after", "by_affines")
+    residuals = [f"{name}_{state}_px" for state in states for name in ("disparity", "y_parallax")]
+    columns = ["site", *places, "correlation", "match_sigma_px", "used", *residuals]
+    rows = []
+    if observations is not None:
+        o, ties = observations, observations.ties
+        at = np.column_stack([ties.left, ties.right + ties.shift, ties.height, o.at])
+        quality = np.column_stack([ties.correlation, ties.sigma])
+        left = np.column_stack([getattr(o, state) for state in states])
+        for k in range(len(ties)):
+            row = [str(ties.site[k]), *(f"{v:.3f}" for v in at[k])]
+            row += [*(f"{v:.4f}" for v in quality[k]), "yes" if o.used[k] else "no"]
+            rows.append(dict(zip(columns, [*row, *(f"{v:.4f}" for v in left[k])])))
+    write_table(csv_file, rows, columns)
+    alignment.save(json_file)

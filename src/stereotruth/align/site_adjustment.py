@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ..core.errors import InputError
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..sensor.rpc import RPC, LineCorrection, SensorModel, of_record, read_correction
 from .align import LARGE_SHIFT
-from .aligned_pair import Alignment, ViewFit
+from .alignment import Alignment, ViewFit
 from .control_points import NoPoints, read_gcps
-from .image_doubts import HEAVY, image_doubts
-from .plan_frame import plan_slopes
+from .doubts import HEAVY, image_doubts
+from .records import ScenePair, covariance_of, read_equations, read_site, rpc_alone
+from .shared_errors import plan_slopes
 from .site_fit import (
     LEAST_POINTS,
     FixedImages,
@@ -27,10 +29,7 @@ from .site_fit import (
     PointsOfImage,
     SiteFit,
     fit_site,
-    residual_figures,
 )
-from .site_pair import ScenePair, read_site, rpc_alone
-from .tie_equations import read_equations
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]
@@ -67,12 +66,6 @@ def _points(rows: Mapping[tuple[Any, ...], None], rpc: RPC, size: tuple[int, int
     )
 
 
-def _px_per_m(rpc: RPC, size: tuple[int, int], height: float) -> Floats:
-    """By how much the middle of an image moves for a metre to the east, to the north [2, 2] px."""
-    lon, lat = rpc.localize((size[0] - 1) / 2, (size[1] - 1) / 2, height)
-    return plan_slopes(SensorModel(rpc), float(lon), float(lat), height)
-
-
 def _images(
     pairs: Sequence[ScenePair], alignments: Mapping[str, Alignment], epoch: Epoch
 ) -> dict[str, ImageToFit]:
@@ -94,12 +87,12 @@ def _images(
             for k in np.flatnonzero(np.isfinite(at[:, 0])):
                 ground = float(points.lon[k]), float(points.lat[k]), float(points.height[k])
                 rows[name][(points.ids[k], *ground, *at[k].tolist())] = None
-    return {
-        name: ImageToFit(
-            name, fit, _points(rows[name], rpc, fit.size), _px_per_m(rpc, fit.size, height)
-        )
-        for name, (fit, rpc, height) in starts.items()
-    }
+    images = {}
+    for name, (fit, rpc, height) in starts.items():
+        lon, lat = map(float, rpc.localize(*((n - 1) / 2 for n in fit.size), height))
+        px_per_m = plan_slopes(SensorModel(rpc), lon, lat, height)
+        images[name] = ImageToFit(name, fit, _points(rows[name], rpc, fit.size), px_per_m)
+    return images
 
 
 def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
@@ -125,16 +118,8 @@ def read_fixed(files: Mapping[str, str | Path]) -> FixedImages | None:
             parameters[name] = np.array(values["images"][name]["parameters"])
             if (lines := read_correction(values["images"][name])) is not None:
                 by_line[name] = lines
-        order = values["covariance"]["images"]
-        index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
-        blocks.append(np.array(values["covariance"]["values"])[np.ix_(index, index)])
-    covariance = np.zeros((6 * len(parameters),) * 2)
-    start = 0
-    for block in blocks:
-        end = start + len(block)
-        covariance[start:end, start:end] = block
-        start = end
-    return FixedImages(parameters, covariance, by_line)
+        blocks.append(covariance_of(values, names))
+    return FixedImages(parameters, block_diag(*blocks), by_line)
 
 
 def adjust_site(
@@ -155,7 +140,7 @@ def adjust_site(
     Raises InputError for unreadable input.
     """
     scenes = sorted(scenes, key=lambda pair: pair.scene)
-    alignments = {pair.scene: Alignment.load(pair.alignment) for pair in scenes}
+    alignments = {pair.scene: Alignment.read(pair.alignment) for pair in scenes}
     images = _images(scenes, alignments, epoch)
     pairs = [
         PairToFit(pair.scene, pair.left, pair.right, *read_equations(pair.equations))
@@ -192,6 +177,19 @@ def adjust_site(
     }
 
 
+def residual_figures(values: Floats) -> dict[str, Any]:
+    """Medians and root mean squares of residuals [n, 2] px, along and across the rows."""
+    if not len(values):
+        return {}
+    return {
+        name: {
+            "median": round(float(np.median(values[:, k])), 4),
+            "rms": round(float(np.sqrt(np.mean(values[:, k] ** 2))), 4),
+        }
+        for k, name in enumerate(("disparity", "y_parallax"))
+    }
+
+
 def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
     figures: dict[str, Any] = {"left": pair.left, "right": pair.right, "reason": pair.reason}
     if pair.ties is None or fit is None:
@@ -212,23 +210,14 @@ def _pair_figures(pair: PairToFit, fit: PairFit | None) -> dict[str, Any]:
     }
 
 
-def _rms(lengths: Floats) -> float | None:
-    known = lengths[np.isfinite(lengths)]
-    return round(float(np.sqrt(np.mean(known**2))), 4) if len(known) else None
-
-
-def _nodes(fit: ViewFit) -> Floats:
-    """[81, 2, 6]: change of places all over an image with its parameters."""
-    axes = (np.linspace(0, n - 1, 9) for n in fit.size)
-    return fit.design(*(axis.ravel() for axis in np.meshgrid(*axes)))
-
-
 def _image_figures(
     image: ImageToFit, pairs: Sequence[PairToFit], fit: SiteFit, is_fixed: bool
 ) -> dict[str, Any]:
     name, points = image.name, image.points
     parameters, covariance = fit.parameters[name], fit.covariance_of(name)
-    nodes, used = _nodes(image.start), fit.used[name]
+    used = fit.used[name]
+    grid = np.meshgrid(*(np.linspace(0, n - 1, 9) for n in image.start.size))
+    nodes = image.start.design(*(axis.ravel() for axis in grid))  # places all over the image
     own = [pair for pair in pairs if name in (pair.left, pair.right)]
     fits = {pair.scene: fit.pairs[pair.scene] for pair in own if pair.scene in fit.pairs}
     residuals = [one.residuals[one.used] for one in fits.values() if one.weight > HEAVY]
@@ -239,6 +228,12 @@ def _image_figures(
         refused = f"neither tie points nor control points ({int(used.sum())}) place it: " + (
             "; ".join(reasons) or "its tie points contradict those of all other pairs"
         )
+
+    def rms(pairs: Floats) -> float | None:
+        lengths = np.hypot(*pairs[used].T)
+        known = lengths[np.isfinite(lengths)]
+        return round(float(np.sqrt(np.mean(known**2))), 4) if len(known) else None
+
     variance = np.einsum("nap,pq,naq->na", nodes, covariance, nodes)
     return {
         "file": image.start.image,
@@ -259,9 +254,9 @@ def _image_figures(
             "count": len(points.ids),
             "used": int(used.sum()),
             "left_out": [points.ids[k] for k in np.flatnonzero(~used)],
-            "before": _rms(np.hypot(*(points.measured - points.predicted)[used].T)),
-            "after": _rms(np.hypot(*fit.residuals[name][used].T)),
-            "leave_one_out": _rms(np.hypot(*fit.leave_one_out[name][used].T)),
+            "before": rms(points.measured - points.predicted),
+            "after": rms(fit.residuals[name]),
+            "leave_one_out": rms(fit.leave_one_out[name]),
             "points": _table(points, fit, name),
         },
         "ties": {

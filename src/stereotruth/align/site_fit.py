@@ -1,48 +1,149 @@
 """One correction per image: the images of a site that share ground, adjusted together.
 
 Unknown are the affine corrections of all images. Three kinds of observations bear on them: the
-RPCs, which are off by RPC_SHIFT and RPC_TILT; control points as measured in each image; and the tie
-points of each pair (:mod:`.refine`), which bind the errors of two images to each other and, on
-slopes, to the LiDAR. A pair enters as its normal equations, whose weights are those of its own
+RPCs, which are off by :func:`.alignment.rpc_prior`; control points as measured in each image; and
+the tie points of each pair (:mod:`.refine`), which bind the errors of two images to each other and,
+on slopes, to the LiDAR. A pair enters as its normal equations, whose weights are those of its own
 robust estimate. Images that share no pair are bound through those between them.
 
 Control points that no correction fits get no weight (Tukey's biweight), and so do pairs whose tie
 points contradict those of the other pairs by more than their errors explain. The result does not
 depend on the order of images or pairs.
+
+Each pair tells by itself whether its lines are off (:mod:`.line_fit`). The images of pairs that do
+get one correction by line each, as Gaussian processes whose standard deviations and length are the
+medians of those pairs. An image that jitters shows it in all of its pairs, its partners in one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from ..core.numerics.statistics import huber_weights, robust_sigma, tukey_weights
 from ..sensor.rpc import LineCorrection
-from .adjustment import Estimate, Sums, estimate
-from .align import CAREFUL_SIGMA, RPC_SHIFT, RPC_TILT
-from .aligned_pair import ViewFit
-from .equations import Equations, PairEquations, PlanObservation
-from .lack_of_fit import shared_spread, with_shared_errors
-from .line_fit import estimate_with_lines
-from .plan_frame import PlanFrame, with_offsets
-from .robust_fit import BLUNDER_FLOOR
-from .site_line_corrections import SiteLines
-from .site_lines import PairOfLines, fit_site_lines
+from .adjustment import FREE, MATCHING, Estimate, Sums, estimate
+from .align import CAREFUL_SIGMA
+from .alignment import ViewFit, rpc_prior
+from .gcp_checks import BLUNDER_FLOOR
+from .line_fit import (
+    LineFit,
+    covariance_at_lines,
+    estimate_with_lines,
+    line_design,
+    posterior_covariance,
+    process,
+    sums_of,
+)
+from .records import Equations, PairEquations, PlanObservation, SiteLines
+from .shared_errors import PlanFrame, shared_spread, with_offsets, with_shared_errors
 
-Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
-
-
+Bools = NDArray[np.bool_]
 STEPS = 60  # of the reweighting, at most
 SETTLED_PX = 1e-6  # change of a step after which no other follows
 FIRST_STEPS = 12  # with weights that leave nothing out: the start is not robust
 SEEN = 1e-6  # share of the largest eigenvalue from which on a pair tells a direction
 LEAST_POINTS = 2  # control points that determine an image's place without tie points, and check it
 OTHERS = 3  # observations of a kind from which on their scatter tells a blunder
+
+
+@dataclass(frozen=True, eq=False)
+class PairOfLines:
+    """A pair's equations, its own estimate and lines; ``images`` by number, left and right."""
+
+    scene: str
+    images: tuple[int, int]
+    equations: Equations
+    estimate: Estimate
+    lines: LineFit
+
+
+def fit_site_lines(
+    pairs: Sequence[PairOfLines], rows: Sequence[int], known: Mapping[int, LineCorrection | None]
+) -> SiteLines:
+    """Of images of ``rows`` lines; ``known`` ones stay as they are."""
+    jittering = [pair for pair in pairs if pair.lines.stands_out]
+    found = {image: lines for image, lines in known.items() if lines is not None}
+    images = sorted({k for pair in jittering for k in pair.images} - set(known))
+    if not images:
+        return SiteLines(found, {})
+    root = process(float(np.median([pair.lines.length for pair in jittering])))
+    rank = root.shape[1]
+    deviations = np.median([pair.lines.rms_px for pair in jittering], axis=0)
+    start = {image: 2 * rank * k for k, image in enumerate(images)}
+    count = 2 * rank * len(images)  # then six of each image's affine
+    size = count + 6 * len(rows)
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    of_known = SiteLines(found, {})
+    for pair in pairs:
+        columns, design, observed = _of_pair(pair, rows, root, start, count, of_known)
+        part, side = sums_of(
+            design, observed, pair.estimate.weights, pair.equations.site, pair.lines.of_site
+        )
+        normal[np.ix_(columns, columns)] += part
+        right[columns] += side
+    variances = np.tile(np.repeat(deviations**2, rank), len(images))
+    prior = np.concatenate([1.0 / variances, np.full(size - count, FREE)])
+    mean = np.linalg.solve(normal + np.diag(prior), right)[:count]
+    covariance = posterior_covariance(normal[:count, :count], variances)
+    for image, at in start.items():
+        values = mean[at : at + 2 * rank].reshape(2, rank) @ root.T
+        found[image] = LineCorrection((0.0, rows[image] - 1.0), np.round(values, 6))
+    padded = np.pad(covariance, (0, 1))  # nothing is unknown of an image without a start
+
+    def own_unknowns(pair: PairOfLines) -> NDArray[np.int64]:
+        of_images = [start[k] + np.arange(2 * rank) if k in start else np.full(2 * rank, -1)
+                     for k in pair.images]  # fmt: skip
+        return np.concatenate(of_images)
+
+    return SiteLines(
+        found,
+        {
+            pair.scene: covariance_at_lines(
+                padded[np.ix_(*[own_unknowns(pair)] * 2)],
+                root,
+                pair.equations.lines,
+                (rows[pair.images[0]], rows[pair.images[1]]),
+            )
+            for pair in pairs
+            if set(pair.images) & set(start)
+        },
+    )
+
+
+def _of_pair(
+    pair: PairOfLines,
+    rows: Sequence[int],
+    root: Floats,
+    start: Mapping[int, int],
+    count: int,
+    known: SiteLines,
+) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Which unknowns a pair tells of, its design [n, 2, p] of them and observations [n, 2], in
+    standard deviations of its matches."""
+    equations = pair.equations
+    own = equations.design
+    of_pair = rows[pair.images[0]], rows[pair.images[1]]
+    parts = np.split(line_design(own, equations.lines, of_pair), 4, axis=-1)
+    columns, design = [], []
+    for k, image in enumerate(pair.images):
+        if image in start:
+            columns.append(start[image] + np.arange(2 * root.shape[1]))
+            design += [part @ root for part in parts[2 * k : 2 * k + 2]]
+        columns.append(count + 6 * image + np.arange(6))
+        design.append(own[:, :, 6 * k : 6 * k + 6])
+    scale = 1.0 / (pair.lines.noise * np.hypot(equations.own, MATCHING))
+    observed = equations.observed - known.effect(own, equations.lines, pair.images)
+    return (
+        np.concatenate(columns),
+        np.concatenate(design, axis=-1) * scale[:, None, None],
+        observed * scale[:, None],
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +164,7 @@ class PointsOfImage:
 @dataclass(frozen=True, eq=False)
 class ImageToFit:
     """An image: its fit by the RPC alone in coordinates of the image, its control points, and
-    ``px_per_m`` [2, 2] as of :func:`.plan_frame.plan_slopes` in its middle."""
+    ``px_per_m`` [2, 2] as of :func:`.shared_errors.plan_slopes` in its middle."""
 
     name: str
     start: ViewFit
@@ -94,14 +195,13 @@ class FixedImages:
 
 @dataclass(frozen=True, eq=False)
 class PairFit:
-    """A pair's own estimate and what all images together make of it.
+    """What all images together make of a pair.
 
     ``residuals`` [n, 2] px along and across the rows; ``used`` bool[n]: not a blunder; ``misfit``:
     the pair against all, in standard deviations; ``weight`` in [0, 1]. ``lines_covariance`` and
-    ``shared_px``: see :data:`.aligned_pair.OF_MISFITS`.
+    ``shared_px``: see :data:`.alignment.OF_MISFITS`.
     """
 
-    estimate: Estimate
     residuals: Floats
     used: Bools
     misfit: float
@@ -115,7 +215,7 @@ class SiteFit:
     """Corrections of all images. ``names`` in ascending order.
 
     ``parameters`` by name [6], of the affine against none in the image's own coordinates
-    (:func:`.aligned_pair.over_the_image`); ``covariance`` [6 n, 6 n] px² in the order of ``names``.
+    (:func:`.alignment.over_the_image`); ``covariance`` [6 n, 6 n] px² in the order of ``names``.
     ``residuals``, ``leave_one_out`` by name [n, 2] px and ``used`` bool[n] of the control points,
     ``point_sigma`` px of one. ``pairs`` by scene, of those that have tie points. ``scatter``: of
     the pairs against each other, in the standard deviations that each states, at least 1.
@@ -141,12 +241,6 @@ class SiteFit:
 
 def _six(k: int) -> NDArray[np.int64]:
     return np.arange(6 * k, 6 * k + 6)
-
-
-def rpc_prior(fit: ViewFit) -> Floats:
-    """Covariance [6, 6] px² of what an RPC is off, in the image's own coordinates."""
-    tilt = (RPC_TILT * fit.scale) ** 2
-    return np.diag([tilt, tilt, RPC_SHIFT**2] * 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,17 +325,14 @@ def _by_themselves(
     names = list(images)
     found = []
     for pair in pairs:
-        of_pair, ties = (pair.left, pair.right), pair.ties
-        prior = np.zeros((12, 12))
-        for k, name in enumerate(of_pair):
-            own = slice(6 * k, 6 * k + 6)
-            prior[own, own] = rpc_prior(images[name].start)
-        rows = tuple(images[name].start.size[1] for name in of_pair)
+        left, right = (images[name].start for name in (pair.left, pair.right))
+        prior = block_diag(rpc_prior(left), rpc_prior(right))
         # Blunders are looked for where the tie points were matched.
-        about = ties.equations.about(ties.linearised_at)
-        told = estimate_with_lines(about, prior, ties.common_px, rows)
+        about = pair.ties.equations.about(pair.ties.linearised_at)
+        rows = left.size[1], right.size[1]
+        told = estimate_with_lines(about, prior, pair.ties.common_px, rows)
         numbers = names.index(pair.left), names.index(pair.right)
-        found.append(PairOfLines(pair.scene, numbers, ties.equations, *told))
+        found.append(PairOfLines(pair.scene, numbers, pair.ties.equations, *told))
     return found
 
 
@@ -272,9 +363,7 @@ def fit_site(
     points = _Points.of(list(by_name.values()), lines)
     known = [_Pair.of(*both, lines) for both in zip(tied, by_itself)]
     count = 6 * len(names)
-    prior = np.zeros((count, count))
-    for k, image in enumerate(by_name.values()):
-        prior[np.ix_(_six(k), _six(k))] = np.linalg.inv(rpc_prior(image.start))
+    prior = block_diag(*(np.linalg.inv(rpc_prior(image.start)) for image in by_name.values()))
     free, x, of_fixed = _unknowns(names, fixed)
     point_weights, pair_weights = np.ones(len(points.delta)), np.ones(len(known))
     sigma, scatter = CAREFUL_SIGMA[0], 1.0
@@ -323,7 +412,6 @@ def fit_site(
         point_sigma=float(sigma),
         pairs={
             pair.scene: PairFit(
-                pair.estimate,
                 pair.equations.observed - pair.equations.design @ x[pair.index],
                 pair.estimate.weights > 0.0,
                 float(misfit),
@@ -357,14 +445,12 @@ def _unknowns(names: Sequence[str], fixed: FixedImages | None) -> tuple[Bools, F
     if fixed is None:
         return free, x, np.zeros((0, 0))
     order = list(fixed.parameters)
-    index = []
+    index = [np.zeros(0, int)]
     for k, name in enumerate(names):
         if name in fixed.parameters:
-            free[_six(k)] = False
-            x[_six(k)] = fixed.parameters[name]
+            free[_six(k)], x[_six(k)] = False, fixed.parameters[name]
             index.append(_six(order.index(name)))
-    index = np.concatenate(index) if index else np.zeros(0, int)
-    return free, x, fixed.covariance[np.ix_(index, index)]
+    return free, x, fixed.covariance[np.ix_(*[np.concatenate(index)] * 2)]
 
 
 def _covariances(
@@ -411,16 +497,3 @@ def _leave_one_out(
         leverage = information[k] * design @ inverse[np.ix_(index, index)] @ design.T
         out[k] = np.linalg.solve(np.eye(2) - leverage, residuals[k])
     return out
-
-
-def residual_figures(values: Floats) -> dict[str, Any]:
-    """Medians and root mean squares of residuals [n, 2] px, along and across the rows."""
-    if not len(values):
-        return {}
-    return {
-        name: {
-            "median": round(float(np.median(values[:, k])), 4),
-            "rms": round(float(np.sqrt(np.mean(values[:, k] ** 2))), 4),
-        }
-        for k, name in enumerate(("disparity", "y_parallax"))
-    }

@@ -24,12 +24,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from ..align.adjustment import estimate, parameters_of
-from ..align.aligned_pair import Alignment, over_the_image
-from ..align.equations import PairEquations
-from ..align.site_fit import rpc_prior
-from ..align.site_line_corrections import SiteLines
-from ..align.tie_equations import read_equations
+from ..align.adjustment import estimate
+from ..align.alignment import Alignment, over_the_image, parameters_of, rpc_prior
+from ..align.records import PairEquations, SiteLines, read_equations
 from ..core.errors import InputError
 from ..core.numerics.interpolation import between_four
 from ..core.products.files import atomic_file, sealed
@@ -308,7 +305,7 @@ def _pairs(triplet: Triplet) -> tuple[_AlignedPair, ...]:
     """The alignments of a triplet, A-B, B-C, A-C."""
     found = []
     for pair in (triplet.ab, triplet.bc, triplet.ac):
-        alignment, ties = Alignment.load(pair.alignment), read_equations(pair.equations)[0]
+        alignment, ties = Alignment.read(pair.alignment), read_equations(pair.equations)[0]
         if ties is not None:  # whose parameters are those of the images alone
             left, right = (over_the_image(fit) for fit in alignment.fits)
             alignment = replace(alignment, left_fit=left, right_fit=right)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..align.aligned_pair import ViewFit
+from ..align.alignment import ViewFit
 from ..core.errors import InputError
 from ..core.job import progress
 from ..core.numerics.geometry import DEGREE_M

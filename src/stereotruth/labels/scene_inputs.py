@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..align.aligned_pair import Alignment
-from ..align.label_uncertainty import LabelUncertainty
-from ..align.strip_uncertainty import with_strips
+from ..align.alignment import Alignment
+from ..align.label_uncertainty import LabelUncertainty, with_strips
 from ..core.config.configuration import LabelSettings
 from ..core.products.grids import require_complete
 from ..core.products.provenance import digest
@@ -139,7 +138,7 @@ class SceneInputs:
         uncertainty = LabelUncertainty.none()
         shared_px = 0.0
         if self.alignment is not None:
-            alignment = Alignment.load(self.alignment)
+            alignment = Alignment.read(self.alignment)
             uncertainty = LabelUncertainty.of(alignment, model, self.view)
             shared_px = alignment.shared_px
         if self.lidar_strips is not None:

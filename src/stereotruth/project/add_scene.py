@@ -11,7 +11,8 @@ import numpy as np
 from rasterio.errors import RasterioError
 
 from ..align.control_points import ControlPoints, read_gcps
-from ..align.gcp_checks import fit_exchanged, misfits_of_sides, open_view
+from ..align.gcp_checks import fit_exchanged, misfits_of_sides
+from ..align.images import open_view
 from ..core import sheets
 from ..core.errors import InputError
 from ..core.products.files import atomic_file, files_below

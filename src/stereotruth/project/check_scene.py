@@ -14,10 +14,9 @@ import rasterio
 from rasterio.errors import RasterioError
 
 from ..align.align import align, from_rpcs
-from ..align.aligned_pair import Alignment
+from ..align.alignment import Alignment
 from ..align.control_points import ControlPoints, TooFewPoints, read_gcps
-from ..align.gcp_checks import open_view
-from ..align.pair_ground import footprint_of
+from ..align.images import footprint_of, open_view
 from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.products.rasters import open_raster
@@ -210,7 +209,7 @@ def _check_alignment(
     model, name = settings.alignment.model, scene.scene
     with found.of("GCPs"), _or_of_others(alone, found):
         if name in settings.alignment.fixed:
-            alignment = Alignment.load(settings.alignment.fixed[name])
+            alignment = Alignment.read(settings.alignment.fixed[name])
         elif images and gcps is not None:
             alignment = align(
                 *pair,

@@ -11,7 +11,7 @@ from pathlib import Path
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from ..align.pair_ground import footprint_of
+from ..align.images import footprint_of
 from ..core.config.configuration import Configuration, Ingest
 from ..core.errors import InputError, in_number, without_secrets
 from ..core.products.remote_files import bring_image, is_remote, state_of

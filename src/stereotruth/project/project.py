@@ -265,7 +265,7 @@ def _remarks_on_lists(
             yield from remarks_on(file)
         if not files or len(files) < len(_lidar_parts(row)):
             continue
-        from ..align.pair_ground import footprint_of  # for few projects
+        from ..align.images import footprint_of  # for few projects
 
         images = scenes[name].left_image, scenes[name].right_image
         ground = footprint_of([images], settings.ingest.margin_m or 0.0)

@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 
 from ..align.control_points import images_measured
-from ..align.site_images import GivenImage, open_image
+from ..align.images import GivenImage, open_image
 from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.products.remote_files import bring_image, is_remote

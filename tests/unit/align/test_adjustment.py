@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.align.adjustment import estimate
-from stereotruth.align.equations import Equations
+from stereotruth.align.records import Equations
 
 # ------------------------------------------------------------------------------- the estimate
 

@@ -1,4 +1,4 @@
-"""Control points of another place, swapped images and axes, doubtful fits."""
+"""Control points of another place, swapped images and axes, wrong RPCs, doubtful fits."""
 
 from __future__ import annotations
 
@@ -8,21 +8,26 @@ import rasterio
 from rasterio.transform import Affine
 
 from stereotruth.align.align import align
-from stereotruth.align.gcp_checks import open_view
+from stereotruth.align.gcp_checks import System, find_blunders
+from stereotruth.align.images import open_view
 from stereotruth.core.errors import InputError
 from stereotruth.sensor.rpc import RPC
 
 from ...synthetic.surveyed_pair import RPCS, SIZES, TRUE, make_gcps, run, write_gcps, write_image
 
 
-def test_points_of_another_place_are_refused(images, tmp_path):
-    rng = np.random.default_rng(3)
-    rows = make_gcps(12)
-    for row in rows:
-        row["left_col"] += rng.normal(0, 30)
-        row["left_row"] += rng.normal(0, 30)
-    with pytest.raises(InputError, match=r"contradict|do not fit"):
-        run(images, tmp_path, rows)
+@pytest.mark.slow
+def test_good_points_with_noise_are_never_thrown_away():
+    """300 random sets of 4 to 20 points with 0.25 px noise."""
+    rng = np.random.default_rng(5)
+    thrown = 0
+    for k in range(300):
+        n = int(rng.integers(4, 21))
+        predicted = rng.uniform(0, 3000, (n, 2))
+        measured = predicted + [5, -8] + 0.25 * rng.standard_normal((n, 2))
+        used, _, _ = find_blunders(System.of("affine", predicted, measured), floor=1.25, seed=k)
+        thrown += int((~used).sum())
+    assert thrown == 0
 
 
 def test_swapped_images_are_recognised(images, tmp_path):
@@ -57,45 +62,39 @@ def test_large_shift_and_tilt_are_doubted(images, tmp_path):
     assert any("scale or angle" in text for text in result.warnings)
 
 
-def other_rpc(tmp_path, changes, **fields):
-    """A pair whose left RPC is changed, in a file beside the image."""
-    values = {k: np.array(v) for k, v in (RPCS["left"].to_dict() | fields).items()}
+@pytest.mark.parametrize(
+    ("changes", "fields"),
+    [
+        ([], {"long_off": 15.0}),
+        ([("samp_num_coeff", 1, 0.0)], {}),
+        ([("samp_num_coeff", 13, -1.0)], {}),
+        ([("line_den_coeff", 1, 3.0)], {}),
+        ([], {"lat_scale": 2e-5}),
+        ([("samp_num_coeff", 0, 0.05), ("samp_num_coeff", 4, 0.1)], {}),
+        ([], None),
+    ],
+)
+def test_a_wrong_rpc_is_named_not_the_control_points(tmp_path, changes, fields):
+    """A pair whose left RPC is changed, in a file beside the image; the last is as it should be."""
+    values = {k: np.array(v) for k, v in (RPCS["left"].to_dict() | (fields or {})).items()}
     for name, i, value in changes:
         values[name][i] = value
     pair = [write_image(tmp_path / f"{v}.tif", RPCS[v], SIZES[v]) for v in ("left", "right")]
     lines = []
     for name, value in values.items():
-        many = value.ndim > 0
         lines += (
             [f"{name.upper()}_{i}: {float(v)!r}" for i, v in enumerate(value, 1)]
-            if many
+            if value.ndim
             else [f"{name.upper()}: {float(value)!r}"]
         )
     (tmp_path / "left_RPC.TXT").write_text("\n".join(lines))
-    return pair
-
-
-@pytest.mark.parametrize(
-    ("changes", "fields", "message"),
-    [
-        ([], {"long_off": 15.0}, "left_RPC.TXT: this RPC leads to ground about lon 15.0"),
-        ([("samp_num_coeff", 1, 0.0)], {}, "do not meet the ground|pixels would be"),
-        ([("samp_num_coeff", 13, -1.0)], {}, "m long here and"),
-        ([("line_den_coeff", 1, 3.0)], {}, "denominator vanishes|m long here"),
-        ([], {"lat_scale": 2e-5}, "m long"),
-        ([("samp_num_coeff", 0, 0.05), ("samp_num_coeff", 4, 0.1)], {}, r"RPC: left_RPC.TXT"),
-    ],
-)
-def test_a_wrong_rpc_is_named_not_the_control_points(tmp_path, changes, fields, message):
-    pair = other_rpc(tmp_path, changes, **fields)
-    with pytest.raises(InputError, match=message) as error:
-        align(*pair, write_gcps(tmp_path / "gcps.csv", make_gcps()), provenance={})
-    assert "left_RPC.TXT" in str(error.value)
-
-
-def test_the_rpc_as_it_is_passes(tmp_path):
-    pair = other_rpc(tmp_path, [])
-    align(*pair, write_gcps(tmp_path / "gcps.csv", make_gcps()), provenance={})
+    gcps = write_gcps(tmp_path / "gcps.csv", make_gcps())
+    if fields is None:
+        align(*pair, gcps, provenance={})
+        return
+    with pytest.raises(InputError) as error:
+        align(*pair, gcps, provenance={})
+    assert "left_RPC.TXT" in str(error.value) and "Remedy: " in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +109,7 @@ def test_an_image_on_a_map_grid_may_have_the_rpc_of_that_grid(tmp_path, turned_d
         dataset.crs = "EPSG:4326"
         dataset.transform = at * Affine.rotation(turned_deg) * Affine.translation(-0.5, -0.5)
     if turned_deg or moved_m > 100:
-        with pytest.raises(InputError, match=r"left\.tif.*on a map grid and has an RPC.*Remedy"):
+        with pytest.raises(InputError, match=r"left\.tif.*Remedy"):
             open_view("left", image, "")
     else:
         open_view("left", image, "")

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.align.aligned_pair import Alignment, GcpResidual
-from stereotruth.align.label_uncertainty import label_sigma
-from stereotruth.align.lidar_checks import lines_of_sight, scatter_by_heights
-from stereotruth.align.refine import refine
-from stereotruth.align.refine_figure import draw_refinement
-from stereotruth.align.refine_report import write_refinement
+from stereotruth.align.alignment import Alignment, GcpResidual
+from stereotruth.align.doubts import lines_of_sight, scatter_by_heights
+from stereotruth.align.figures import draw_refinement
+from stereotruth.align.label_uncertainty import label_covariance
+from stereotruth.align.refine import refine, write_refinement
 from stereotruth.core.errors import InputError
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.sensor.rpc import SensorModel
@@ -25,8 +24,6 @@ from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
 from ...synthetic.images import write_image
 from ...synthetic.pictures import colours_in, read_picture, share_of
 from ...synthetic.textured_pair import NONE, SIZE, TRUE, start, surface
-
-SHIFT = np.array([0.0, 0.0, 1.0])
 
 
 def texture(east: np.ndarray, north: np.ndarray) -> np.ndarray:
@@ -111,7 +108,8 @@ def test_rpcs_alone_are_brought_together(images, points):
     assert max(relative_error(planted)) > 10.0
     assert max(relative_error(refined)) < 0.03
     model = fit_epipolar(refined.left, refined.right, SIZE, SIZE, HEIGHT)
-    disparity, x, y = label_sigma(refined, model, model.shape[1] / 2, model.shape[0] / 2)
+    middle = model.shape[1] / 2, model.shape[0] / 2
+    disparity, x, y = np.sqrt(np.diag(label_covariance(refined, model, *middle)))
     assert disparity < 0.03
     # The common part is seen on slopes only: the uncertainty of the labels' places says so.
     miss = np.subtract(refined.left.project(LON, LAT, HEIGHT), TRUE[0].project(LON, LAT, HEIGHT))
@@ -160,14 +158,6 @@ def test_what_both_images_share_stays_as_the_gcps_say(images, points):
     refined, _ = refine(sure, *images, [points])
     assert np.abs(refined.left.affine - TRUE[0].affine)[:, 2].max() < 1e-3
     assert max(relative_error(refined)) < 0.02
-
-
-def test_a_simpler_model_is_refined_too(images, points):
-    planted = start(NONE, PLANTED * SHIFT, 0.5, "shift")
-    fixed = np.diag([0.0, 0.0, 0.25] * 2)
-    fits = [replace(fit, covariance=fixed) for fit in planted.fits]
-    refined, _ = refine(replace(planted, left_fit=fits[0], right_fit=fits[1]), *images, [points])
-    assert max(relative_error(refined)) < 0.03
 
 
 @pytest.mark.slow
@@ -231,18 +221,7 @@ def test_more_than_the_gcps_explain_is_doubted(images, points, tmp_path):
 
 
 @pytest.mark.slow
-def test_lidar_beside_its_place_is_doubted(images, tmp_path):
-    """What the disparities do not see: the common part is told by the slopes."""
-    cloud = lidar()
-    cloud[:, 0] += 2.0 / METRES[0]
-    store = write_points(tmp_path, cloud)
-    refined, _ = refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store])
-    assert len(refined.warnings) == 1 and "coordinate system" in refined.warnings[0]
-    assert abs(refined.refinement["lidar_height"]["offset_m"]) < 0.3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("metres", "doubted"), [(0.0, False), (0.4, False), (-30.0, True)])
+@pytest.mark.parametrize(("metres", "doubted"), [(0.4, False), (-30.0, True)])
 def test_heights_without_control_points_are_held_against_the_rpcs(
     images, tmp_path, metres, doubted
 ):
@@ -263,7 +242,7 @@ def test_heights_without_control_points_are_held_against_the_rpcs(
     assert np.abs(np.subtract(raised, TRUE[0].project(LON, LAT, HEIGHT))).max() < 1.0
 
 
-@pytest.mark.parametrize(("metres", "told"), [(0.02, False), (0.15, False), (0.4, True)])
+@pytest.mark.parametrize(("metres", "told"), [(0.15, False), (0.4, True)])
 def test_heights_that_scatter_more_than_lidar_tell_of_other_ground(metres, told):
     """As of images that were cut, with the RPCs of before: no point says where they look."""
     alignment, rng = start(NONE, NONE, 10.0), np.random.default_rng(1)
@@ -271,6 +250,17 @@ def test_heights_that_scatter_more_than_lidar_tell_of_other_ground(metres, told)
     along, across = rng.normal(0, 1, (2, 80)) * [[np.hypot(0.02, px_per_m * metres)], [0.02]]
     scatter, explained = scatter_by_heights(alignment, along, across)
     assert (scatter > explained) == told
+
+
+@pytest.mark.slow
+def test_lidar_beside_its_place_is_doubted(images, tmp_path):
+    """What the disparities do not see: the common part is told by the slopes."""
+    cloud = lidar()
+    cloud[:, 0] += 2.0 / METRES[0]
+    store = write_points(tmp_path, cloud)
+    refined, _ = refine(with_gcp(start(NONE, NONE, 0.05)), *images, [store])
+    assert len(refined.warnings) == 1 and "coordinate system" in refined.warnings[0]
+    assert abs(refined.refinement["lidar_height"]["offset_m"]) < 0.3
 
 
 @pytest.mark.slow
@@ -289,7 +279,7 @@ def test_json_keeps_the_refinement(found, images, tmp_path):
     files = [tmp_path / name for name in ("a.json", "o.csv", "f.png")]
     write_refinement(refined, observations, *files[:2])
     draw_refinement(refined, *files[1:], images[0])
-    again = Alignment.load(files[0])
+    again = Alignment.read(files[0])
     assert again.to_dict() == refined.to_dict()
     assert (again.covariance == refined.covariance).all()
     with files[1].open(newline="") as stream:
@@ -302,8 +292,7 @@ def test_json_keeps_the_refinement(found, images, tmp_path):
         picture, (np.array([0.36, 0.72]) * len(picture)).astype(int)
     )
     assert share_of(upper, "C0") > 1e-3  # arrows of the sites
-    assert colours_in(over_image) > 2e-3  # tie points over the image
-    assert colours_in(lower) > 2e-3  # and histograms below
+    assert min(colours_in(over_image), colours_in(lower)) > 2e-3  # tie points, histograms
     unrefined = replace(refined, refinement={"applied": False, "reason": "x"})
     write_refinement(unrefined, None, *files[:2])
     draw_refinement(unrefined, *files[1:], images[0])

@@ -32,7 +32,7 @@ def points_of(cloud: np.ndarray, firm: np.ndarray | None = None) -> SitePoints:
     return SitePoints.sorted(*cloud.T.copy(), firm, (WIDE, WIDE), PARALLAX)
 
 
-@pytest.mark.parametrize("per_px", [0.11, 0.4, 2.0])
+@pytest.mark.parametrize("per_px", [0.11, 2.0])
 def test_a_third_of_crowns_does_not_tilt_a_plane(per_px):
     rng = np.random.default_rng(7)
     cloud = ground(rng, per_px)
@@ -44,14 +44,6 @@ def test_a_third_of_crowns_does_not_tilt_a_plane(per_px):
     assert planes[0, 1:3] == pytest.approx(SLOPES, abs=0.006)
     assert planes[0, 3] == pytest.approx(0.03, rel=0.5)
     assert share[0] == pytest.approx(inside.sum() / (inside.sum() + n), abs=0.06)
-
-
-def test_crowns_all_over_are_no_plane_to_match_on():
-    rng = np.random.default_rng(8)
-    at = rng.uniform(0, WIDE - 1, (9000, 2))
-    rough = np.column_stack([at, LEVEL + rng.uniform(0, 4, 9000)])
-    planes, _ = points_of(rough).fit_planes(CENTRE[None])
-    assert not planes[0, 3] < 0.5
 
 
 @pytest.mark.parametrize("number", range(len(GUARDS)))
@@ -84,15 +76,3 @@ def test_a_pulse_of_several_returns_and_a_hole_are_left_out():
     assert not clear[np.hypot(col - 5, row - 5) < 2.5].any()
     assert not clear[np.hypot(col + 6, row + 6) < 2.0].any()
     assert clear[row > 8].mean() > 0.9 and clear[col > 9].mean() > 0.9
-
-
-def test_points_in_any_order_give_the_same_plane_and_pixels():
-    rng = np.random.default_rng(11)
-    cloud = np.vstack([ground(rng, 1.0), crown(rng, (64.0, 57.0), 4.0, 30)])
-    planes, clear = [], []
-    for order in (np.arange(len(cloud)), rng.permutation(len(cloud))):
-        points = points_of(cloud[order])
-        planes.append(points.fit_planes(CENTRE[None])[0][0])
-        clear.append(points.clear_pixels(CENTRE[None], planes[-1:])[0, 0])
-    assert (planes[0] == planes[1]).all()
-    assert (clear[0] == clear[1]).all()

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereotruth.align.aligned_pair import Alignment, ViewFit
-from stereotruth.align.tie_equations import write_equations
+from stereotruth.align.alignment import Alignment, ViewFit
+from stereotruth.align.records import write_equations
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.fit import fit_epipolar
@@ -135,7 +135,7 @@ def test_the_uncertainty_explains_labels_that_differ_by_their_reading(tmp_path):
 def test_the_alignment_counts_where_an_image_has_two_corrections(tmp_path):
     triplet = triplet_of(tmp_path, noise=NOISE)
     _, alike = closure_of_labels(triplet)
-    record = Alignment.load(triplet.bc.alignment)
+    record = Alignment.read(triplet.bc.alignment)
     affine = record.left_fit.affine + np.array([[0.0, 0.0, 1e-3], [0.0, 0.0, 0.0]])
     fit = replace(record.left_fit, affine=affine)
     moved = replace(record, left=SensorModel(record.left.rpc, affine), left_fit=fit)

@@ -11,7 +11,7 @@ from stereocities.cities import Canopy, lidar_files
 from stereocities.lidar import simulate_lidar_tile
 from stereocities.sites import drawn_site, image_truth
 from stereocities.surfaces import TREE
-from stereotruth.align.aligned_pair import ViewFit
+from stereotruth.align.alignment import ViewFit
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import open_grid
 from stereotruth.labels.image_heights import (

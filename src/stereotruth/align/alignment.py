@@ -1,11 +1,14 @@
-"""The corrected RPCs of a pair, with residuals and covariance: alignment.json."""
+"""The corrected RPCs of a pair, with residuals and covariance: what an alignment's file holds.
+
+:meth:`Alignment.read` is the only reader of such files, whichever stage made them.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +17,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError
 from ..core.products.files import atomic_file, read_perhaps_edited, read_record, sealed
-from ..sensor.rpc import SensorModel
+from ..sensor.rpc import LineCorrection, SensorModel
 
 log = logging.getLogger("stereotruth")
 
 Floats = NDArray[np.float64]
 
 
+RPC_SHIFT = 10.0  # px, standard deviation of what an RPC without control points is off, and
+RPC_TILT = 3e-4  # of its scale, rotation and shear
 UNITS = {
     "col, row, before, after, leave_one_out, sigma0, rms": "px of the original image",
     "lon, lat": "degrees, WGS 84",
@@ -39,6 +44,7 @@ OF_MISFITS = {
     "shared_px": "px, standard deviation of disparity by errors that near tie points share and no "
     "correction fits",
 }
+PAIRS = ("measured", "predicted", "before", "after", "leave_one_out")  # of a GcpResidual
 
 
 @dataclass(frozen=True)
@@ -127,6 +133,12 @@ def over_the_image(fit: ViewFit) -> ViewFit:
     return replace(fit, origin=((cols - 1) / 2, (rows - 1) / 2), scale=max(cols, rows) / 2)
 
 
+def rpc_prior(fit: ViewFit) -> Floats:
+    """Covariance [6, 6] px² of what an RPC is off, in the fit's own coordinates."""
+    tilt = (RPC_TILT * fit.scale) ** 2
+    return np.diag([tilt, tilt, RPC_SHIFT**2] * 2)
+
+
 @dataclass(frozen=True, eq=False)
 class Alignment:
     """Aligned sensor models of a pair, with how they were found.
@@ -173,15 +185,18 @@ class Alignment:
         """Left and right."""
         return self.left_fit, self.right_fit
 
+    @property
+    def middle(self) -> tuple[float, float, float]:
+        """(lon, lat, height) of what the middle of the left image shows, degrees and m."""
+        cols, rows = self.left_fit.size
+        height = self.reference_height
+        lon, lat = self.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+        return float(lon), float(lat), height
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready; what is undetermined is null."""
-        views = {
-            name: sensor.to_dict() | _fit_to_dict(fit)
-            for name, sensor, fit in (
-                ("left", self.left, self.left_fit),
-                ("right", self.right, self.right_fit),
-            )
-        }
+        sensors = self.left, self.right
+        views = {f.view: s.to_dict() | _fit_to_dict(f) for f, s in zip(self.fits, sensors)}
         misfits: dict[str, Any] = {}
         if self.lines_covariance is not None:
             misfits["lines_covariance"] = self.lines_covariance.tolist()
@@ -231,14 +246,14 @@ class Alignment:
             scratch.write_text(sealed(self.to_dict()), encoding="utf-8")
 
     @classmethod
-    def load(cls, path: str | Path) -> Alignment:
+    def read(cls, path: str | Path) -> Alignment:
         """Read what :meth:`save` wrote, or what a user made of it for ``alignment.fixed``.
 
         A file that is not as it was written is told in the log. Raises InputError if it cannot be
         used, or says why the pair has no alignment.
         """
 
-        def read(file: str | Path) -> dict[str, Any]:
+        def values_of(file: str | Path) -> dict[str, Any]:
             values, is_as_written = read_perhaps_edited(file)
             if not is_as_written:
                 log.warning("%s: edited since it was made; its values are used as they are", file)
@@ -251,37 +266,78 @@ class Alignment:
                 )
             return values
 
-        return read_record(path, cls.from_dict, what="alignment", stage="align", read=read)
+        return read_record(path, cls.from_dict, what="alignment", stage="align", read=values_of)
+
+
+def prior_of(alignment: Alignment) -> Floats:
+    """Covariance [12, 12] of both fits; what a simpler model keeps fixed may be off as RPCs are."""
+    prior = alignment.covariance.copy()
+    if alignment.model == "affine":
+        return prior
+    free = np.zeros((6, 6))
+    free[[0, 1, 3, 4], [0, 1, 3, 4]] = 1.0
+    if alignment.model == "similarity":
+        for turn in ([1, 0, 0, 0, 1, 0], [0, -1, 0, 1, 0, 0]):
+            free -= np.outer(turn, turn) / 2.0
+    for k, fit in enumerate(alignment.fits):
+        own = slice(6 * k, 6 * k + 6)
+        prior[own, own] += free * (RPC_TILT * fit.scale) ** 2
+    return prior
+
+
+def parameters_of(fit: ViewFit) -> Floats:
+    """[6] of a fit's affine against none, in the order of ``covariance`` and its coordinates."""
+    change = fit.affine - np.eye(2, 3)
+    at_origin = change[:, 2] + change[:, :2] @ np.array(fit.origin)
+    return np.column_stack([change[:, :2] * fit.scale, at_origin]).ravel()
+
+
+def with_corrections(
+    alignment: Alignment,
+    parameters: Floats,
+    by_line: tuple[LineCorrection | None, LineCorrection | None] = (None, None),
+) -> Alignment:
+    """The alignment with both affines moved by parameters [12], and corrections by line."""
+    fits, sensors = [], []
+    for fit, sensor, own, lines in zip(
+        alignment.fits,
+        (alignment.left, alignment.right),
+        (parameters[:6], parameters[6:]),
+        by_line,
+    ):
+        affine = fit.moved(own)
+        sensors.append(SensorModel(sensor.rpc, affine, lines))
+        gcps = []
+        for gcp in fit.gcps:
+            at = affine @ (*gcp.predicted, 1.0)
+            after = np.array(gcp.measured) - (at if lines is None else np.array(lines.add(*at)))
+            gcps.append(replace(gcp, after=tuple(after.tolist())))
+        fits.append(replace(fit, affine=affine, gcps=tuple(gcps)))
+    return replace(
+        alignment,
+        left=sensors[0],
+        right=sensors[1],
+        left_fit=fits[0],
+        right_fit=fits[1],
+    )
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
 def _fit_to_dict(fit: ViewFit) -> dict[str, Any]:
-    def pair(values: tuple[float, float]) -> list[float | None]:
-        return [float(v) if math.isfinite(v) else None for v in values]
-
     gcps = [
-        {
-            "id": g.id,
-            "lon": g.lon,
-            "lat": g.lat,
-            "height": g.height,
-            "measured": pair(g.measured),
-            "predicted": pair(g.predicted),
-            "before": pair(g.before),
-            "after": pair(g.after),
-            "leave_one_out": pair(g.leave_one_out),
-            "used": g.used,
-            "reason": g.reason,
-        }
+        asdict(g) | {name: [_finite(v) for v in getattr(g, name)] for name in PAIRS}
         for g in fit.gcps
     ]
-    rms = {which: fit.rms(which) for which in ("before", "after", "leave_one_out")}
     return {
         "image": fit.image,
         "size": list(fit.size),
         "gcps": gcps,
         "left_out": [g.id for g in fit.left_out],
-        "rms": {name: value if math.isfinite(value) else None for name, value in rms.items()},
-        "sigma0": fit.sigma0 if math.isfinite(fit.sigma0) else None,
+        "rms": {which: _finite(fit.rms(which)) for which in PAIRS[2:]},
+        "sigma0": _finite(fit.sigma0),
         "redundancy": fit.redundancy,
         "origin": list(fit.origin),
         "scale": fit.scale,
@@ -289,20 +345,19 @@ def _fit_to_dict(fit: ViewFit) -> dict[str, Any]:
     }
 
 
-def _fit_from_dict(view: str, values: Mapping[str, Any]) -> ViewFit:
-    def gcp(record: Mapping[str, Any]) -> GcpResidual:
-        pairs = {
-            name: tuple(math.nan if v is None else v for v in record[name])
-            for name in ("measured", "predicted", "before", "after", "leave_one_out")
-        }
-        return GcpResidual(**{**record, **pairs})
+def gcp_of(record: Mapping[str, Any]) -> GcpResidual:
+    """A point of an alignment's file; what is null there is undetermined."""
+    pairs = {name: tuple(math.nan if v is None else v for v in record[name]) for name in PAIRS}
+    return GcpResidual(**{**record, **pairs})
 
+
+def _fit_from_dict(view: str, values: Mapping[str, Any]) -> ViewFit:
     return ViewFit(
         view=view,
         image=values["image"],
         size=tuple(values["size"]),
         affine=np.array(values["affine"]),
-        gcps=tuple(gcp(record) for record in values["gcps"]),
+        gcps=tuple(gcp_of(record) for record in values["gcps"]),
         sigma0=math.nan if values["sigma0"] is None else values["sigma0"],
         redundancy=values["redundancy"],
         origin=tuple(values["origin"]),

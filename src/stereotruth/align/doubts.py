@@ -1,4 +1,4 @@
-"""Doubts about the LiDAR's heights: by the control points, by the images, and by the RPCs.
+"""Doubts and remarks in words: the LiDAR's heights, images of a site, why labels are less sure.
 
 A fault of the vertical datum (geoid left out or added twice, feet for metres, another zero) moves
 the LiDAR along the vertical, which the images see as a shift of both, each along its own line of
@@ -10,8 +10,9 @@ off by an unknown amount, a common vertical shift is a change of both images lik
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,11 @@ from ..lidar.point_store import PointStore, query_points
 from ..sensor.rpc import SensorModel
 from .adjustment import Estimate
 from .align import CAREFUL_SIGMA
-from .aligned_pair import Alignment, GcpResidual
+from .alignment import Alignment, GcpResidual
+from .line_fit import LineFit
+from .shared_errors import SharedErrors, plan_slopes
 
+Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 
@@ -38,6 +42,16 @@ AROUND = 12  # points around a control point that are looked at, or all
 WIDEST_M = 5.0  # within this, or none
 FEWEST_GCPS = 3
 MODEL_MARGIN_M, MODEL_MARGIN = 10.0, 0.1  # m, and share of the LiDAR's span: what rises above it
+MIN_USED = 0.5  # share of the tie points or places, less of which tell of a fault
+TOLD = 2.0  # times that σ grows, from which on it is said
+HEAVY = 0.1  # weight of a pair that is left out, or nearly so
+CHANCE_OF_SITE = 0.05  # that a site without a fault has an image that stands out
+FEWEST_VALUES = 4  # values of a test: if two of three are alike, the third is always an outlier
+MOST_OUT = 0.25  # share of the images that may stand out
+NORMAL = 2.0 / 3.0  # power of a length that is normal if both coordinates are (Wilson, Hilferty)
+LEAST_SPREAD_PX = 0.3  # px to that power, of corrections: less makes none of them stand out
+LEAST_SPREAD_SHARE = 0.1  # of the shares that match, likewise
+Figures = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -175,9 +189,7 @@ def lines_of_sight(alignment: Alignment) -> Floats:
 
     In the left and the right image, (col, row).
     """
-    cols, rows = alignment.left_fit.size
-    height = alignment.reference_height
-    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
+    lon, lat, height = alignment.middle
     moved = []
     for sensor in (alignment.left, alignment.right):
         ends = [np.array(sensor.project(lon, lat, height + z)) for z in (-5.0, 5.0)]
@@ -221,21 +233,10 @@ def chance_of_contradiction(alignment: Alignment, found: Estimate) -> float:
 
     ``alignment`` as it came. A LiDAR that is off in plan moves both images alike.
     """
-    cols, rows = alignment.left_fit.size
-    height = alignment.reference_height
-    lon, lat = alignment.left.localize((cols - 1) / 2, (rows - 1) / 2, height)
-    step = LIDAR_PLAN_M / metres_per_degree(float(lat))
-    moved = []
-    for east, north in ((step[0], 0.0), (0.0, step[1])):
-        ends = [
-            np.stack([
-                np.array(sensor.project(lon + sign * east, lat + sign * north, height))
-                for sensor in (alignment.left, alignment.right)
-            ])
-            for sign in (-0.5, 0.5)
-        ]  # fmt: skip
-        moved.append(np.linalg.pinv(found.root) @ _constants(ends[1] - ends[0]))
-    plan = np.stack(moved, axis=1)
+    sensors = alignment.left, alignment.right
+    slopes = np.stack([plan_slopes(sensor, *alignment.middle) for sensor in sensors])
+    moved = [_constants(LIDAR_PLAN_M * slopes[:, :, k]) for k in (0, 1)]
+    plan = np.linalg.pinv(found.root) @ np.stack(moved, axis=1)
     values, vectors = np.linalg.eigh(found.normal)
     seen = values > 1e-9 * values.max()
     alone = vectors[:, seen].T @ np.linalg.pinv(found.root) @ found.alone
@@ -271,3 +272,146 @@ def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) ->
     square = float(np.sum((others @ moved) ** 2) + np.trace(others @ covariance @ others))
     sigma = float(np.hypot(np.sqrt(square / 3) / length, LIDAR_SIGMA_M))
     return HeightOffset(amount / length, sigma, -float(stdtrit(3, CHANCE_OF_RPCS / 2)) * sigma)
+
+
+@dataclass(frozen=True)
+class LabelSigma:
+    """Standard deviation px of disparity on level ground, median of the tie points: by the scatter
+    of the tie points alone, and as labels state it."""
+
+    by_scatter: float
+    stated: float
+
+    @classmethod
+    def of(
+        cls,
+        design: Floats,
+        lines: Floats,
+        rows: int,
+        covariances: tuple[Floats, Floats],
+        fit: LineFit,
+        shared: SharedErrors,
+    ) -> LabelSigma:
+        """At tie points: ``design`` [n, 12] along the rows, ``lines`` [n] of the left image, which
+        has ``rows``; ``covariances`` [12, 12] of the parameters by scatter alone and as stated."""
+        alone, all_ = (np.einsum("np,pq,nq->n", design, c, design) for c in covariances)
+        all_ = all_ + shared.label_px**2
+        if (nodes := fit.used_covariance) is not None:
+            at = np.clip(np.rint(lines / (rows - 1.0) * (len(nodes) - 1)), 0, len(nodes) - 1)
+            shifts = design[:, [2, 5, 8, 11]]
+            all_ = all_ + np.einsum("np,npq,nq->n", shifts, nodes[at.astype(int)], shifts)
+        return cls(*(float(np.sqrt(np.median(values))) for values in (alone, all_)))
+
+
+def remark_of(sigma: LabelSigma, fit: LineFit, shared: SharedErrors) -> str:
+    """A sentence where lines are corrected, or σ grows by more than TOLD; else nothing."""
+    grown = sigma.stated > TOLD * sigma.by_scatter
+    causes = []
+    if fit.stands_out:
+        along, across = fit.rms_px
+        causes.append(
+            f"the attitude jitters (residuals of tie points depend on the image line, by "
+            f"{along:.2f} px along and {across:.2f} px across the lines), which is corrected by "
+            "line"
+        )
+    if shared.are_told and grown:
+        amount = f"{shared.sigma_px[0]:.3f} px of disparity"
+        causes.append(
+            f"residuals change smoothly over the scene and not by line ({amount}), as RPCs leave "
+            "that no affine corrects"
+            if shared.smooth
+            else f"tie points near each other share errors, not by line ({amount}), as strips of "
+            "the LiDAR that disagree leave"
+        )
+    if not causes:
+        return ""
+    stated = (
+        f"the alignment's part of labels' uncertainty is {sigma.stated:.3f} px instead of "
+        f"{sigma.by_scatter:.3f} px"
+    )
+    return "; ".join([*causes, stated] if grown else causes)
+
+
+def stand_out(values: Floats, least_spread: float) -> Bools:
+    """Which of n values are too large for the others, by the generalised extreme deviate test.
+
+    Rosner 1983: the largest value is held against mean and standard deviation (``least_spread`` at
+    least), then the largest of the others, and so on; all up to the last one that Student's t makes
+    too unlikely stand out, so that two of them do not hide each other.
+    """
+    order = np.argsort(values)[::-1]
+    count = 0
+    for k in range(max(1, int(MOST_OUT * len(values)))):
+        rest = values[order[k:]]
+        n = len(rest)
+        if n < FEWEST_VALUES:
+            break
+        t = stdtrit(n - 2, 1.0 - CHANCE_OF_SITE / n)
+        limit = (n - 1) * t / np.sqrt((n - 2 + t**2) * n)
+        spread = max(float(rest.std(ddof=1)), least_spread)
+        if rest[0] - rest.mean() > limit * spread:
+            count = k + 1
+    out = np.zeros(len(values), bool)
+    out[order[:count]] = True
+    return out
+
+
+def _named(values: Mapping[str, float], sign: float, least_spread: float) -> set[str]:
+    """The names whose values, times ``sign``, are too large for the others."""
+    out = stand_out(sign * np.array(list(values.values())), least_spread)
+    return {name for name, is_out in zip(values, out) if is_out}
+
+
+def image_doubts(images: Figures, pairs: Figures) -> dict[str, list[str]]:
+    """The doubts of each image by name; ``images``, ``pairs``: figures of the adjustment."""
+    own = {
+        name: [pair for pair in pairs.values() if name in (pair["left"], pair["right"])]
+        for name in images
+    }
+    placed = [name for name, image in images.items() if not image["refused"]]
+    lengths = {
+        name: float(np.hypot(images[name]["correction"]["col"], images[name]["correction"]["row"]))
+        for name in placed
+    }
+    far = _named({name: v**NORMAL for name, v in lengths.items()}, 1.0, LEAST_SPREAD_PX)
+    # A pair matches no better than the poorer of its images: the best pair tells of both.
+    shares = {
+        name: max(pair["matched"] for pair in own[name])
+        for name in placed
+        if any(pair["tie_points"] for pair in own[name])
+    }
+    usual, usual_share = (
+        float(np.median(list(values.values()))) if values else 0.0 for values in (lengths, shares)
+    )
+    poor = _named(shares, -1.0, LEAST_SPREAD_SHARE)
+    poor |= {name for name, share in shares.items() if share < MIN_USED * usual_share}
+    doubts: dict[str, list[str]] = {}
+    for name, image in images.items():
+        texts = doubts.setdefault(name, [])
+        gcps, count = image["gcps"], len(own[name])
+        if image["refused"]:
+            texts.append(image["refused"])
+            continue
+        if name in far and not image["fixed"]:
+            texts.append(
+                f"its RPC is off by {lengths[name]:.1f} px, where {usual:.1f} px are usual here; "
+                "corrected"
+            )
+        if name not in shares:
+            reasons = "; ".join(sorted({pair["reason"] for pair in own[name]}))
+            texts.append(f"no tie points in any of its pairs ({count}): {reasons}")
+        elif name in poor:
+            texts.append(
+                f"of the places compared in its pairs {100 * shares[name]:.0f} % match at best, "
+                f"where {100 * usual_share:.0f} % are usual here: clouds, or another ground?"
+            )
+        light = sum(pair.get("weight", 1.0) < HEAVY for pair in own[name])
+        if light > count / 2:
+            texts.append(
+                f"the tie points of {light} of its {count} pairs contradict the other images"
+            )
+        if gcps["left_out"]:
+            texts.append(
+                f"control points left out, which fit no correction: {', '.join(gcps['left_out'])}"
+            )
+    return doubts

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from stereotruth.align.align_figure import draw_residuals
-from stereotruth.align.align_report import write_alignment
-from stereotruth.align.aligned_pair import Alignment
+from stereotruth.align.align import write_alignment
+from stereotruth.align.alignment import Alignment
+from stereotruth.align.figures import draw_residuals
+from stereotruth.core.errors import InputError
 
 from ...synthetic.surveyed_pair import make_gcps, run
 
@@ -23,7 +24,7 @@ def test_json_keeps_everything(images, tmp_path):
     result = run(images, tmp_path, rows)
     paths = [tmp_path / f"residuals.{ext}" for ext in ("json", "csv", "png")]
     write_alignment(result, *paths[:2])
-    again = Alignment.load(paths[0])
+    again = Alignment.read(paths[0])
     draw_residuals(again, paths[2])
     assert again.to_dict() == result.to_dict()
     assert np.array_equal(again.left.packed(), result.left.packed())
@@ -45,11 +46,19 @@ def test_an_edited_alignment_is_used_as_it_is_and_told(images, tmp_path, caplog)
     """A user moves an alignment by hand and names the copy in ``alignment.fixed``."""
     file = tmp_path / "alignment.json"
     run(images, tmp_path, make_gcps(10)).save(file)
-    Alignment.load(file)
+    Alignment.read(file)
     assert not caplog.records
     values = json.loads(file.read_text())
     values["right"]["affine"][0][2] += 0.15
     file.write_text(json.dumps(values))
-    moved = Alignment.load(file)
+    moved = Alignment.read(file)
     assert moved.right_fit.affine[0][2] == values["right"]["affine"][0][2]
     assert "alignment.json: edited since it was made" in caplog.text
+
+
+def test_alignments_that_are_none_are_refused(tmp_path):
+    (tmp_path / "x.json").write_text("{}")
+    for name in ("none.json", "x.json"):
+        with pytest.raises(InputError) as caught:
+            Alignment.read(tmp_path / name)
+        assert name in str(caught.value) and "Remedy: " in str(caught.value)
