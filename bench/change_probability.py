@@ -44,16 +44,17 @@ from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.labels.change_evidence import Evidence, LabelledWindow, change_evidence
 from stereotruth.labels.change_probability import (
     CHANGED,
+    LEARNED,
     TREES,
     UNCHANGED,
+    learned,
+    least_probability,
     probability_by,
     probability_by_evidence,
     trees,
     with_surroundings,
 )
 from stereotruth.labels.crowns import with_crowns
-from stereotruth.labels.image_agreement import least_probability
-from stereotruth.labels.learned_evidence import LEARNED, learned
 from stereotruth.labels.recipe import lidar_labels
 from stereotruth.labels.window_points import read_window
 from stereotruth.lidar.point_store import WATER_CLASS

@@ -24,9 +24,9 @@ from stereotruth.core.products.grids import Layer, require_complete
 from stereotruth.core.products.resumable_grids import resumable_grid
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify_image
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.paper_correlation import correlate
-from stereotruth.labels.pixel_points import Collection
+from stereotruth.labels.pair_window import read_patch
+from stereotruth.labels.paper_recipe import correlate
+from stereotruth.labels.window_points import Collection
 from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.smooth_maps import PatchedTransform
 from stereotruth.sensor.image_reader import Source

@@ -35,9 +35,8 @@ from stereotruth.core.products.files import atomic_folder
 from stereotruth.core.status import Status, is_labelled
 from stereotruth.epipolar.image_noise import EQUAL
 from stereotruth.labels.change_evidence import LabelledWindow
-from stereotruth.labels.change_probability import change_probability
+from stereotruth.labels.change_probability import change_probability, least_probability
 from stereotruth.labels.crowns import with_crowns
-from stereotruth.labels.image_agreement import least_probability
 from stereotruth.labels.pair_window import PairWindow, WindowLabels
 from stereotruth.labels.recipe import lidar_labels
 from stereotruth.labels.scene_inputs import SceneInputs

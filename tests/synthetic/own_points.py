@@ -18,7 +18,7 @@ import numpy as np
 from stereotruth.core.config.labels import LabelSettings
 from stereotruth.core.status import Status
 from stereotruth.labels import recipe
-from stereotruth.labels.facet_labels import facet_labels
+from stereotruth.labels.pixel_labels import facet_labels
 
 from .box_scene import Scene
 

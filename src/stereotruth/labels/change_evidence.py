@@ -30,10 +30,10 @@ from ..epipolar.surface_windows import (
 )
 from ..epipolar.window_sums import wanted_runs
 from ..lidar.point_store import VEGETATION_CLASSES
+from .crowns import beside_young_crowns
 from .pair_window import PairWindow
 from .pixel_labels import Labels
 from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
-from .young_crowns import beside_young_crowns
 
 Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]

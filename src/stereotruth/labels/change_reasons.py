@@ -29,7 +29,7 @@ from ..core.numerics.summed_area import window_sums
 from ..core.status import Reason, Status
 from ..lidar.point_store import VEGETATION_CLASSES, WATER_CLASS
 from .change_evidence import WINDOW_PX
-from .image_agreement import Comparison
+from .change_probability import Comparison
 from .pair_window import PairWindow, WindowLabels
 from .pixel_labels import OwnPoints
 from .shifted_agreement import WIDE_SHIFTS_PX, shifted_agreement

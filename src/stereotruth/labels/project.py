@@ -33,9 +33,9 @@ from ..core.status import Status, carries_label, is_labelled
 from ..epipolar.model import EpipolarModel
 from ..lidar.overlap_check import apart, refuse_apart
 from .change_evidence import Evidence
-from .image_patches import MaskedImage
 from .layers import layers
 from .lidar_read import lidar_read
+from .pair_window import MaskedImage
 from .recipe import label_window
 from .scene_inputs import SceneInputs
 

@@ -3,7 +3,7 @@
 The recipe surface, step by step; equations and a figure: docs/explanation/surface.md.
 
 1. *Points.* The LiDAR's points are projected into both images and sorted by pixel
-   (:mod:`.pixel_points`).
+   (:mod:`.window_points`).
 2. *Facets.* The surface of the points has been made for all pairs of the site: facets, and
    triangles that are undecided (:mod:`stereotruth.surface.surface`). Those are taken that the
    window may see (:mod:`.ground_in_view`).
@@ -11,10 +11,10 @@ The recipe surface, step by step; equations and a figure: docs/explanation/surfa
    and each pixel's position in the right image is tested against them
    (:mod:`stereotruth.surface.raster`). A pixel has the label of its nearest facet if nothing may
    hide it in either view; if its own points on this facet are the surer ones, theirs
-   (:mod:`.facet_labels`). Rough surfaces, of which no triangle is a facet, get labels of their own
+   (:mod:`.pixel_labels`). Rough surfaces, of which no triangle is a facet, get labels of their own
    (:mod:`.crowns`).
 4. *Agreement of the images.* Surfaces on which both images contradict the LiDAR have changed
-   (:mod:`.image_agreement`).
+   (:mod:`.change_probability`).
 5. *Changes.* What has changed, by the LiDAR's classes and by the height at which the images agree
    (:mod:`.change_reasons`).
 6. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
@@ -32,17 +32,14 @@ from numpy.typing import NDArray
 from ..core.status import Status
 from ..epipolar.image_noise import EQUAL
 from ..surface.raster import ProjectedSurface
-from .change_probability import MEANS_PX
+from .change_probability import MEANS_PX, Comparison, beyond_counts, without_changes
 from .change_reasons import REASON_PX, with_reasons
 from .crowns import Crowns, crowns, with_crowns, without_contours
-from .facet_labels import facet_labels
 from .ground_in_view import ground_in_view
-from .image_agreement import Comparison, without_changes
 from .layers import layers_of
-from .learned_evidence import beyond_counts
 from .pair_window import PairWindow, WindowLabels
 from .paper_recipe import paper_labels
-from .pixel_labels import OwnPoints, own_labels
+from .pixel_labels import OwnPoints, facet_labels, own_labels
 from .scene_inputs import SceneInputs
 from .window_points import WindowPoints, read_window
 

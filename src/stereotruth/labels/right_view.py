@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..align.label_uncertainty import LabelUncertainty
 from ..core.status import Status
 from ..epipolar.model import EpipolarModel
-from .image_patches import Array2D, MaskedImage
+from .pair_window import Array2D, MaskedImage
 from .view_geometry import ViewGeometry
 
 Floats = NDArray[np.float64]

@@ -38,11 +38,10 @@ from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX
 from .crowns import CROWN_REACH_PX
 from .ground_in_view import blocks_in_view
-from .image_patches import MaskedImage
-from .pixel_scale import PixelScale
-from .point_windows import PointWindows
-from .rays import Rays
+from .pair_window import MaskedImage
 from .right_view import Pair, seen_from
+from .view_geometry import PixelScale, Rays
+from .window_points import PointWindows
 
 log = logging.getLogger("stereotruth")
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from ..core.numerics.degrees import DEGREE_M
+from ..lidar.lattice import LATTICE_DEG
+from ..surface.scale import GROUND_CELL_PX, SurfaceScale
 
 Floats = NDArray[np.float64]
 
@@ -23,3 +28,105 @@ class ViewGeometry(Protocol):
         self, x: ArrayLike, y: ArrayLike, height: ArrayLike
     ) -> tuple[Floats, Floats]:
         """(lon, lat) in degrees where the left image's ray meets a height."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Directions of the rays to both cameras, and the size of the surface's cells.
+
+    ``track`` float64[2, 2, 3]: (view, lon or lat, coefficients of 1, x, y): degrees that a ray to
+    the left (0) or right (1) camera moves over the ground per metre of height, as a linear function
+    of the left epipolar pixel. ``cell``: (lon, lat) size of a cell in lattice steps.
+    ``px_per_m``: disparity per metre of height in the scene's middle.
+    """
+
+    track: Floats
+    cell: tuple[int, int]
+    px_per_m: float
+
+    @classmethod
+    def of(cls, model: ViewGeometry) -> Rays:
+        """From the epipolar model alone."""
+        rows, cols = model.shape
+        # An odd count, so that the middle of the grid is among the places.
+        y, x = (
+            c.reshape(-1)
+            for c in np.meshgrid(
+                np.linspace(0, rows - 1, 5), np.linspace(0, cols - 1, 5), indexing="ij"
+            )
+        )
+        low = np.full(x.size, float(model.reference_height))
+        rise = 50.0  # m
+        lon, lat = model.epipolar_to_ground(x, y, low)
+        base = model.ground_to_epipolar(lon, lat, low)
+        x_high = x.copy()
+        left = np.stack(model.epipolar_to_ground(x, y, low + rise))
+        right = left
+        disparity = np.zeros(x.size)
+        for step in range(4):  # x_left of the point of the right ray at the greater height
+            right = np.stack(model.epipolar_to_ground(x_high, y, low + rise))
+            there = model.ground_to_epipolar(*right, low + rise)
+            if step == 0:
+                disparity = there[0] - there[2] - (base[0] - base[2])
+            x_high += base[2] - there[2]
+        design = np.stack([np.ones(x.size), x, y], axis=1)
+        seen = np.isfinite(lon) & np.isfinite(left).all(0) & np.isfinite(right).all(0)
+        track = np.empty((2, 2, 3))
+        for view, end in enumerate((left, right)):
+            for axis, start in enumerate((lon, lat)):
+                values = (end[axis] - start)[seen] / rise
+                track[view, axis] = np.linalg.lstsq(design[seen], values, rcond=None)[0]
+        track = np.round(track, 15)  # degrees: drops what depends on the linear algebra library
+        # Square cells on the ground, of the area of a left pixel.
+        middle = (
+            np.array([cols / 2, cols / 2 + 1, cols / 2]),
+            np.array([rows / 2] * 2 + [rows / 2 + 1]),
+        )
+        lon3, lat3 = model.epipolar_to_ground(*middle, np.full(3, float(model.reference_height)))
+        shrink = np.cos(np.radians(lat3[0]))
+        area = abs(
+            (lon3[1] - lon3[0]) * (lat3[2] - lat3[0]) - (lon3[2] - lon3[0]) * (lat3[1] - lat3[0])
+        )  # degrees²
+        side = GROUND_CELL_PX * np.sqrt(area * shrink) / LATTICE_DEG  # steps of latitude
+        cell = (max(round(side / shrink), 1), max(round(side), 1))
+        return cls(track, cell, float(np.round(np.nanmedian(disparity) / rise, 9)))
+
+    @property
+    def cell_m(self) -> float:
+        """Side of a cell on the ground, m."""
+        return self.cell[1] * LATTICE_DEG * DEGREE_M
+
+    @property
+    def pixel_m(self) -> float:
+        """Side of a pixel on the ground, m."""
+        return self.cell_m / GROUND_CELL_PX
+
+    def moves(self, cols: slice, rows: slice) -> Floats:
+        """[2, 2] (lon, lat; lowest, highest) degrees per metre that any ray from a window moves."""
+        corners = np.array(
+            [[1.0, x, y] for x in (cols.start, cols.stop) for y in (rows.start, rows.stop)]
+        )
+        moves = self.track @ corners.T  # [view, axis, corner]
+        low = np.minimum(moves.min(axis=(0, 2)), 0.0)
+        high = np.maximum(moves.max(axis=(0, 2)), 0.0)
+        return np.stack([low, high], axis=1)
+
+
+@dataclass(frozen=True)
+class PixelScale:
+    """The scale of a pair's labels: ``px_per_m``, disparity of a metre of height; ``pixel_m``, side
+    of a pixel on the ground; ``surface``."""
+
+    px_per_m: float
+    pixel_m: float
+    surface: SurfaceScale
+
+    @classmethod
+    def of(cls, surface: SurfaceScale, rays: Rays) -> PixelScale:
+        """From the surface, and the rays to both cameras."""
+        return cls(rays.px_per_m, rays.pixel_m, surface)
+
+    @property
+    def spacing_px(self) -> float:
+        """Mean spacing of points in pixels."""
+        return self.surface.spacing_m / self.pixel_m

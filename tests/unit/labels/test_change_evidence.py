@@ -14,8 +14,7 @@ from stereotruth.labels.change_evidence import (
     LabelledWindow,
     change_evidence,
 )
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow
+from stereotruth.labels.pair_window import PairWindow, read_patch
 from stereotruth.labels.pixel_labels import Labels
 
 from ...synthetic.textured_fields import (

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from stereotruth.labels.change_evidence import LabelledWindow
-from stereotruth.labels.change_probability import CHANGED, change_probability
-from stereotruth.labels.image_agreement import Comparison, contradicted
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.learned_evidence import ASKED, beyond_counts, beyond_learned, learned
-from stereotruth.labels.pair_window import PairWindow
+from stereotruth.labels.change_probability import (
+    ASKED,
+    CHANGED,
+    Comparison,
+    beyond_counts,
+    beyond_learned,
+    change_probability,
+    contradicted,
+    learned,
+)
+from stereotruth.labels.pair_window import PairWindow, read_patch
 from stereotruth.labels.pixel_labels import Labels
 
 from ...synthetic.textured_fields import (

@@ -9,10 +9,9 @@ import pytest
 
 from stereocities.changes import REASONS
 from stereotruth.core.status import Reason, Status
+from stereotruth.labels.change_probability import Comparison
 from stereotruth.labels.change_reasons import REASON_PX, VEHICLE_M, is_common, with_reasons
-from stereotruth.labels.image_agreement import Comparison
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow, WindowLabels
+from stereotruth.labels.pair_window import PairWindow, WindowLabels, read_patch
 from stereotruth.labels.pixel_labels import Labels, OwnPoints
 from stereotruth.labels.shifted_agreement import WIDE_SHIFTS_PX
 

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from stereotruth.core.status import Status
-from stereotruth.labels.facet_labels import facet_labels
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow
-from stereotruth.labels.pixel_labels import Labels, OwnLabels, OwnPoints
-from stereotruth.labels.pixel_scale import PixelScale
+from stereotruth.labels.pair_window import PairWindow, read_patch
+from stereotruth.labels.pixel_labels import Labels, OwnLabels, OwnPoints, facet_labels
+from stereotruth.labels.view_geometry import PixelScale
 from stereotruth.surface.raster import VISIBLE, SeenSurface
 from stereotruth.surface.scale import SurfaceScale, ground_cell
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from stereotruth.epipolar.surface_windows import apart_from_steps, surface_correlation
-from stereotruth.labels.image_agreement import Comparison, contradicted
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow
+from stereotruth.labels.change_probability import Comparison, contradicted
+from stereotruth.labels.pair_window import PairWindow, read_patch
 from stereotruth.labels.pixel_labels import Labels
 
 from ...synthetic import textured_fields as fields

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.paper_correlation import correlate
-from stereotruth.labels.pixel_points import Collection
+from stereotruth.labels.pair_window import read_patch
+from stereotruth.labels.paper_recipe import correlate
+from stereotruth.labels.window_points import Collection
 
 SHAPE = (120, 160)
 ROWS, COLS = slice(-6, 130), slice(-6, 180)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pixel_points import PX, Collection, PixelPoints
+from stereotruth.labels.pair_window import read_patch
+from stereotruth.labels.window_points import PX, Collection, PixelPoints
 
 ROWS, COLS = slice(10, 50), slice(30, 90)
 ORIGIN = (1000, 2000)

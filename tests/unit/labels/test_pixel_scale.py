@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereotruth.labels.pixel_scale import PixelScale
-from stereotruth.labels.rays import Rays
+from stereotruth.labels.view_geometry import PixelScale, Rays
 from stereotruth.surface.scale import FACET_RESIDUAL_PX, SurfaceScale
 
 

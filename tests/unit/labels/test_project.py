@@ -18,8 +18,7 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.products.grids import open_grid
 from stereotruth.core.status import Reason, Status, is_labelled
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.labels.facet_labels import facet_labels
-from stereotruth.labels.pixel_labels import RIDGE, Labels
+from stereotruth.labels.pixel_labels import RIDGE, Labels, facet_labels
 from stereotruth.labels.project import FAR_BEYOND, project_scene
 from stereotruth.labels.recipe import label_window
 from stereotruth.labels.scene_inputs import SceneInputs

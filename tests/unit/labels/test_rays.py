@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.labels.rays import Rays
+from stereotruth.labels.view_geometry import Rays
 from stereotruth.lidar.lattice import LATTICE_DEG
 
 from ...synthetic.cameras import BACKWARD, FORWARD, HEIGHT, METRES, camera

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.epipolar.surface_windows import apart_from_steps, surface_correlation, surface_mean
-from stereotruth.labels.image_agreement import Comparison, contradicted
+from stereotruth.labels.change_probability import Comparison, contradicted
 from stereotruth.labels.pair_window import PairWindow
 from stereotruth.labels.pixel_labels import Labels
 from stereotruth.labels.shifted_agreement import SHIFTS_PX, ShiftedAgreement, shifted_agreement

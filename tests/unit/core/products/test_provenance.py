@@ -112,7 +112,7 @@ def test_the_simulator_shares_no_code_with_the_pipeline():
         *STAGES,
         "stereotruth.sensor.rpc",
         "stereotruth.epipolar.model",
-        "stereotruth.labels.rays",
+        "stereotruth.labels.view_geometry",
     }
 
 
