@@ -13,13 +13,15 @@ depend on blocks.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.numerics.box_max import box_max
+from ..core.numerics.summed_area import summed_area
 from ..epipolar.surface_windows import (
     alike_correlation,
     apart_from_steps,
@@ -30,12 +32,12 @@ from ..epipolar.surface_windows import (
 )
 from ..epipolar.window_sums import wanted_runs
 from ..lidar.point_store import VEGETATION_CLASSES
-from .crowns import beside_young_crowns
-from .pair_window import PairWindow
-from .pixel_labels import Labels
+from .pair_window import Labels, PairWindow
 from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
 
+Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Bits = NDArray[np.uint32]
 Bools = NDArray[np.bool_]
 
 CLOSE_PX = 5  # side of the windows that see what is a few pixels wide
@@ -53,6 +55,15 @@ ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image'
 # Both images of the same ground differ by noise; by labels that are off by so many px over the
 # brightness of a slope; and by this share of the brightness.
 OFF_PX, OFF_SHARE = 0.1, 0.01
+
+
+# A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation:
+# 2.4 m wide in pixels of 0.65 m. One that doubles covers 2 px around, and the optics blur it by
+# one.
+YOUNG_REACH_PX, YOUNG_PIXELS = 3, 14
+NO_NOISE = 0.0, 0.0
+ASKED = np.uint32(1)
+LEARNED = Path(__file__).with_suffix(".tsv")
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,3 +278,45 @@ def _from_step(clear: Bools) -> Singles:
     for px in range(FAR_PX - 1, -1, -1):
         out[box_max(~clear, px)] = px
     return out
+
+
+def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
+    """Pixels [h, w] no more than YOUNG_REACH_PX from a crown of the LiDAR that is small, by the
+    ``surface_class`` [h, w] (ASPRS)."""
+    is_young = np.isin(surface_class, VEGETATION_CLASSES)
+    row, col = np.nonzero(is_young)
+    margin = 2 * YOUNG_REACH_PX
+    table = summed_area(np.pad(is_young, margin))
+
+    def count(px: int) -> NDArray[np.int64]:
+        """Of vegetation up to ``px`` around each of its pixels."""
+        top, side = row + margin - px, col + margin - px
+        end, far = top + 2 * px + 1, side + 2 * px + 1
+        return table[end, far] - table[top, far] - table[end, side] + table[top, side]
+
+    around = count(YOUNG_REACH_PX)
+    is_small = (around <= YOUNG_PIXELS) & (count(margin) <= 2 * YOUNG_PIXELS)
+    is_young[row, col] = is_small & (2 * count(1) >= around)  # compact, no branches of a canopy
+    return box_max(is_young, YOUNG_REACH_PX)
+
+
+@cache
+def learned(diachronic: bool) -> Floats:
+    """Lowest and greatest value [2, k] of each figure of the evidence that trees are fitted to, but
+    for one in a hundred at either end."""
+    rows = np.loadtxt(LEARNED, np.float64, delimiter="\t", skiprows=1, usecols=(1, 2, 3))
+    return rows[rows[:, 0] == diachronic, 1:].T
+
+
+def beyond_learned(evidence: Singles, diachronic: bool) -> Bits:
+    """Which of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]: the bit
+    ASKED, and from the next one on a bit for each figure."""
+    low, high = learned(diachronic)[..., None]
+    is_beyond = (evidence < low) | (evidence > high)  # false for NaN
+    return ASKED + (np.uint32(2) << np.arange(len(evidence), dtype=np.uint32)) @ is_beyond
+
+
+def beyond_counts(beyond: Bits) -> NDArray[np.int64]:
+    """Of pixels [h, w]: how many were asked, and how many lie beyond by each figure [1 + k]."""
+    figures = learned(False).shape[1]
+    return np.array([(beyond >> bit & 1).sum(dtype=np.int64) for bit in range(1 + figures)])

@@ -11,7 +11,6 @@ these agree less where nothing has changed, since shadows have moved.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -20,13 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.numerics.decision_trees import DecisionTrees
-from ..core.status import Status, is_labelled
 from ..epipolar.surface_windows import alike_mean, surface_mean
 from ..epipolar.window_sums import SURFACE_PX, wanted_runs
-from ..lidar.point_store import WATER_CLASS
-from .change_evidence import LabelledWindow, change_evidence
-from .pair_window import PairWindow, WindowLabels
-from .pixel_labels import Labels
+from .change_evidence import LabelledWindow, beyond_learned, change_evidence
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -107,51 +102,11 @@ def probability_by(fitted: DecisionTrees, features: Singles) -> Floats:
     return 1.0 / (1.0 + np.exp(-fitted.sum_at(features).astype(np.float64)))
 
 
-Bits = NDArray[np.uint32]
-
-ASKED = np.uint32(1)
-LEARNED = Path(__file__).with_suffix(".tsv")
-
-
-@cache
-def learned(diachronic: bool) -> Floats:
-    """Lowest and greatest value [2, k] of each figure of the evidence that trees are fitted to, but
-    for one in a hundred at either end."""
-    rows = np.loadtxt(LEARNED, np.float64, delimiter="\t", skiprows=1, usecols=(1, 2, 3))
-    return rows[rows[:, 0] == diachronic, 1:].T
-
-
-def beyond_learned(evidence: Singles, diachronic: bool) -> Bits:
-    """Which of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]: the bit
-    ASKED, and from the next one on a bit for each figure."""
-    low, high = learned(diachronic)[..., None]
-    is_beyond = (evidence < low) | (evidence > high)  # false for NaN
-    return ASKED + (np.uint32(2) << np.arange(len(evidence), dtype=np.uint32)) @ is_beyond
-
-
-def beyond_counts(beyond: Bits) -> NDArray[np.int64]:
-    """Of pixels [h, w]: how many were asked, and how many lie beyond by each figure [1 + k]."""
-    figures = learned(False).shape[1]
-    return np.array([(beyond >> bit & 1).sum(dtype=np.int64) for bit in range(1 + figures)])
-
-
-NO_NOISE = 0.0, 0.0
-
-
-class Comparison(NamedTuple):
-    """How both images are compared: side of the ``window_px`` of the layer ``correlation``;
-    ``noise`` of both images, variances; ``diachronic``: whether they share no light."""
-
-    window_px: int
-    noise: tuple[float, float]
-    diachronic: bool = False
-
-
 class Contradicted(NamedTuple):
     """What the images of a window say of its labels; arrays [h, w].
 
     ``changed``: where they contradict these; ``variance`` (px²) of labels that they do not
-    contradict, though these may have changed; ``beyond``: see :class:`.ChangeProbability`.
+    contradict, though these may have changed; ``beyond``: see :class:`ChangeProbability`.
     """
 
     changed: Bools
@@ -165,40 +120,13 @@ def least_probability(compared: LabelledWindow) -> Floats:
     return np.where(compared.vegetation, CROWN_CHANGED, by_ground)
 
 
-def contradicted(
-    labels: Labels,
-    window: PairWindow,
-    comparison: Comparison,
-    labelled: Bools,
-    surface_class: NDArray[np.uint8],
-) -> Contradicted:
-    """Which of the ``labelled`` pixels [h, w] the images contradict.
+def contradicted(compared: LabelledWindow, diachronic: bool) -> Contradicted:
+    """Which labelled pixels [h, w] the images contradict.
 
-    ``surface_class`` [h, w] (ASPRS): of what the labels show. Labels of images of one light count
-    as right where these do not contradict them.
+    Labels of images of one light count as right where these do not contradict them; of images that
+    share no light (``diachronic``) they may have changed.
     """
-    compared = LabelledWindow(window, labels, labelled, surface_class, comparison.noise)
-    probability, beyond = change_probability(compared, comparison.diachronic)
-    changed = labelled & (probability > least_probability(compared))
-    variance = probability * SURFACE_PX**2 if comparison.diachronic else 0.0
+    probability, beyond = change_probability(compared, diachronic)
+    changed = compared.labelled & (probability > least_probability(compared))
+    variance = probability * SURFACE_PX**2 if diachronic else 0.0
     return Contradicted(changed, variance, beyond)
-
-
-def without_changes(
-    labels: WindowLabels, window: PairWindow, equal: PairWindow, comparison: Comparison
-) -> WindowLabels:
-    """Labels without those that the images contradict, and without water; with the correlation of
-    the images over each pixel's surface.
-
-    ``equal``: the ``window`` with images of equal noise, as ``comparison`` has it.
-    """
-    labelled = is_labelled(labels.status)
-    by_images = contradicted(labels.labels, equal, comparison, labelled, labels.surface_class)
-    as_it_is = LabelledWindow(window, labels.labels, labelled, labels.surface_class, NO_NOISE)
-    correlation, _ = as_it_is.correlation(comparison.window_px)
-    changed = by_images.changed | labelled & (labels.surface_class == WATER_CLASS)
-    status = labels.status.copy()
-    status[changed] = Status.CHANGED
-    with_unseen = replace(labels.labels, variance=labels.labels.variance + by_images.variance)
-    by_both = {"correlation": correlation, "beyond": by_images.beyond}
-    return replace(labels, status=status, labels=with_unseen, **by_both)

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from ..core.kernels import kernel
 from ..core.numerics.box_max import box_max
-from ..core.numerics.summed_area import summed_area, window_sums
+from ..core.numerics.summed_area import window_sums
 from ..core.status import Status, is_labelled
 from ..lidar.lattice import LATTICE_M
-from ..lidar.point_store import VEGETATION_CLASSES, WATER_CLASS
+from ..lidar.point_store import WATER_CLASS
 from ..surface.facet_values import Facets, PixelValues
 from ..surface.raster import (
     FACET_IN_RIGHT,
@@ -40,8 +40,7 @@ from ..surface.raster import (
 )
 from ..surface.rough_tops import RoughTops
 from ..surface.scale import FACET_RESIDUAL_PX
-from .pair_window import PairWindow, WindowLabels
-from .pixel_labels import Labels
+from .pair_window import Labels, PairWindow, WindowLabels, merged_status
 from .view_geometry import PixelScale
 
 Floats = NDArray[np.float64]
@@ -68,29 +67,28 @@ GROWTH = 0.66
 
 
 @kernel
-def _higher(disparity: Floats, reach: int) -> Floats:
-    """By how much the highest disparity up to ``reach`` px around is above each pixel's own, px
-    (κ of eq. 12 of docs/explanation/surface.md); NaN where a pixel has none."""
+def _higher(disparity: Floats, reach: int, wanted: Bools) -> Floats:
+    """By how much the highest disparity up to ``reach`` px around is above each ``wanted`` pixel's
+    own, px (κ of eq. 12 of docs/explanation/surface.md); NaN elsewhere."""
     rows, cols = disparity.shape
-    along, out = np.empty_like(disparity), np.empty_like(disparity)
+    out = np.full(disparity.shape, np.nan)
     for j in range(rows):
         for i in range(cols):
-            along[j, i] = -np.inf
-            for a in range(max(i - reach, 0), min(i + reach + 1, cols)):
-                if disparity[j, a] > along[j, i]:  # false for NaN
-                    along[j, i] = disparity[j, a]
-    for j in range(rows):
-        for i in range(cols):
+            if not wanted[j, i]:
+                continue
             high = -np.inf
             for b in range(max(j - reach, 0), min(j + reach + 1, rows)):
-                high = max(high, along[b, i])
+                for a in range(max(i - reach, 0), min(i + reach + 1, cols)):
+                    if disparity[b, a] > high:  # false for NaN
+                        high = disparity[b, a]
             out[j, i] = high - disparity[j, i]
     return out
 
 
 @kernel
-def _clearance(disparity: Floats, above: Floats, reach_rows: int) -> Floats:
-    """Distance px in the right image from each pixel to the nearest surface that is higher.
+def _clearance(disparity: Floats, above: Floats, reach_rows: int, wanted: Bools) -> Floats:
+    """Distance px in the right image from each ``wanted`` pixel to the nearest surface that is
+    higher; infinite elsewhere.
 
     ``disparity`` [h, w] of the pixels, ``above`` [h, w] of what may be higher, NaN for nothing. The
     next BESIDE_PX to the right in the left image count, in ``reach_rows`` rows above and below the
@@ -98,19 +96,16 @@ def _clearance(disparity: Floats, above: Floats, reach_rows: int) -> Floats:
     docs/explanation/surface.md).
     """
     rows, cols = disparity.shape
-    highest = np.full(above.shape, -np.inf)
-    for j in range(rows):
-        for b in range(max(j - reach_rows, 0), min(j + reach_rows + 1, rows)):
-            for i in range(cols):
-                if above[b, i] > highest[j, i]:  # false for NaN
-                    highest[j, i] = above[b, i]
     out = np.full(disparity.shape, np.inf)
     for j in range(rows):
         for i in range(cols):
-            for a in range(i + 1, min(i + BESIDE_PX + 1, cols)):
-                rise = highest[j, a] - disparity[j, i]
-                if rise > ABOVE_PX and a - i - rise < out[j, i]:
-                    out[j, i] = a - i - rise
+            if not wanted[j, i]:
+                continue
+            for b in range(max(j - reach_rows, 0), min(j + reach_rows + 1, rows)):
+                for a in range(i + 1, min(i + BESIDE_PX + 1, cols)):
+                    rise = above[b, a] - disparity[j, i]
+                    if rise > ABOVE_PX and a - i - rise < out[j, i]:  # false for NaN
+                        out[j, i] = a - i - rise
     return out
 
 
@@ -161,7 +156,7 @@ class NearestTops:
         """Where a gentle triangle is nearest, and nothing near it is much higher."""
         with np.errstate(invalid="ignore"):
             out = self.disparity > self.before - OCCLUSION_TOLERANCE_PX
-            return out & (_higher(self.highest, HIGHER_REACH) <= HIGHER_PX)
+            return out & (_higher(self.highest, HIGHER_REACH, out) <= HIGHER_PX)
 
     def values(self, chosen: Bools, projected: ProjectedSurface) -> PixelValues:
         """What the triangles of the ``chosen`` pixels have there; the variance is none of
@@ -175,7 +170,7 @@ class NearestTops:
     def variance(self, chosen: Bools, rough: RoughTops, scale: PixelScale) -> Floats:
         """Variance px² [h, w] of what the ``chosen`` pixels show, NaN elsewhere."""
         out = np.full(chosen.shape, np.nan)
-        higher = _higher(self.highest, 1)[chosen]
+        higher = _higher(self.highest, 1, chosen)[chosen]
         out[chosen] = _variance(rough, self.index[chosen], higher, scale)
         return out
 
@@ -191,7 +186,7 @@ def crowns(seen: SeenSurface, scale: PixelScale, edge_margin_px: float) -> Crown
         labelled = is_open & nearest.in_front()
         labelled &= ~(np.abs(disparity - seen.disparity) <= FACET_RESIDUAL_PX)
     spacing_rows = int(np.ceil(scale.spacing_px))
-    labelled &= _clearance(disparity, nearest.highest, spacing_rows) >= CLEARANCE_PX
+    labelled &= _clearance(disparity, nearest.highest, spacing_rows, labelled) >= CLEARANCE_PX
     labelled &= ~_hidden_in_right(seen.projected, labelled, disparity)
     values = nearest.values(labelled, seen.projected)
     variance = nearest.variance(labelled, seen.projected.surface.tops, scale)
@@ -221,10 +216,10 @@ def without_contours(
     reach = int(scale.spacing_px)
     if reach:
         beside |= box_max(hidden, reach)
-    uncertain = _clearance(labels.labels.disparity, crowns.tops, 1) < np.sqrt(2) * scale.spacing_px
-    status = labels.status.copy()
-    status[is_labelled(status) & beside & uncertain] = Status.EDGE_IN_PIXEL
-    return replace(labels, status=status)
+    beside &= is_labelled(labels.status)
+    clearance = _clearance(labels.labels.disparity, crowns.tops, 1, beside)
+    uncertain = beside & (clearance < np.sqrt(2) * scale.spacing_px)
+    return replace(labels, status=merged_status({Status.EDGE_IN_PIXEL: uncertain}, labels.status))
 
 
 def _hidden_in_right(projected: ProjectedSurface, labelled: Bools, disparity: Floats) -> Bools:
@@ -261,16 +256,14 @@ def with_crowns(labels: WindowLabels, crowns: Crowns, window: PairWindow) -> Win
 
     Labels of other statuses stay as they are.
     """
-    row, col = np.nonzero(crowns.visible & (labels.status == Status.EDGE_IN_PIXEL))
-    inside, _ = window.usable(row, col, crowns.labels.disparity[row, col])
-    new = np.zeros(labels.status.shape, np.bool_)
-    new[row[inside], col[inside]] = True
+    new = crowns.visible & (labels.status == Status.EDGE_IN_PIXEL)
+    new, _ = window.usable(new, crowns.labels.disparity)
     around = window_sums(np.pad(new | is_labelled(labels.status), 1), 3)
     new &= around >= LABELS_AROUND
     of_crowns, others = crowns.labels, labels.labels
     return replace(
         labels,
-        status=np.where(new, np.uint8(Status.LABELLED_CROWN), labels.status),
+        status=merged_status({Status.LABELLED_CROWN: new}, labels.status),
         labels=Labels(
             np.where(new, of_crowns.disparity, others.disparity),
             np.where(new, of_crowns.slope, others.slope),
@@ -280,29 +273,3 @@ def with_crowns(labels: WindowLabels, crowns: Crowns, window: PairWindow) -> Win
         surface_class=np.where(new, crowns.surface_class, labels.surface_class),
         day=np.where(new, crowns.day, labels.day),
     )
-
-
-# A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation:
-# 2.4 m wide in pixels of 0.65 m. One that doubles covers 2 px around, and the optics blur it by
-# one.
-YOUNG_REACH_PX, YOUNG_PIXELS = 3, 14
-
-
-def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
-    """Pixels [h, w] no more than YOUNG_REACH_PX from a crown of the LiDAR that is small, by the
-    ``surface_class`` [h, w] (ASPRS)."""
-    is_young = np.isin(surface_class, VEGETATION_CLASSES)
-    row, col = np.nonzero(is_young)
-    margin = 2 * YOUNG_REACH_PX
-    table = summed_area(np.pad(is_young, margin))
-
-    def count(px: int) -> NDArray[np.int64]:
-        """Of vegetation up to ``px`` around each of its pixels."""
-        top, side = row + margin - px, col + margin - px
-        end, far = top + 2 * px + 1, side + 2 * px + 1
-        return table[end, far] - table[top, far] - table[end, side] + table[top, side]
-
-    around = count(YOUNG_REACH_PX)
-    is_small = (around <= YOUNG_PIXELS) & (count(margin) <= 2 * YOUNG_PIXELS)
-    is_young[row, col] = is_small & (2 * count(1) >= around)  # compact, no branches of a canopy
-    return box_max(is_young, YOUNG_REACH_PX)

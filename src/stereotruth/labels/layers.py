@@ -8,26 +8,31 @@ from numpy.typing import NDArray
 from ..core.config.labels import LabelSettings
 from ..core.products.grids import Layer
 from ..core.status import Reason, Status, is_labelled, statuses_of
-from .pair_window import PairWindow, WindowLabels
+from .pair_window import WindowLabels
 from .right_view import Pair
 
 GREATEST_COUNT = 65535  # of points of a pixel that is stored
 
 
-def layers_of(labels: WindowLabels, pair: Pair, window: PairWindow) -> dict[str, NDArray]:
-    """The layers of a window, without its margin, from its ``labels`` there.
+def layers_of(
+    labels: WindowLabels,
+    correlation: NDArray[np.floating],
+    change: NDArray[np.uint8],
+    pair: Pair,
+    rows: slice,
+    cols: slice,
+) -> dict[str, NDArray]:
+    """The layers of a window of a pair from its ``labels``, the ``correlation`` of both images and
+    why it has changed (:class:`.status.Reason`).
 
     The variance of the alignment joins that of the labels (eq. 13 of docs/explanation/surface.md).
     """
-    y, x = (
-        np.arange(grid.start + window.margin, grid.stop - window.margin, dtype=np.float64)
-        for grid in (window.rows, window.cols)
-    )
+    y, x = (np.arange(grid.start, grid.stop, dtype=np.float64) for grid in (rows, cols))
     variance = labels.labels.variance + pair.alignment_variance(x, y, labels.labels.slope)
     values = {
         "disparity": labels.labels.disparity,
         "height": labels.height,
-        "correlation": labels.correlation,
+        "correlation": correlation,
         "uncertainty": np.sqrt(variance),
     }
     known = is_labelled(labels.status)
@@ -38,7 +43,7 @@ def layers_of(labels: WindowLabels, pair: Pair, window: PairWindow) -> dict[str,
     layers["surface_class"] = np.where(known, labels.surface_class, 0).astype(np.uint8)
     layers["lidar_date"] = np.where(known, labels.day, 0).astype(np.uint16)
     layers["status"] = labels.status
-    layers["change"] = labels.change
+    layers["change"] = change
     return layers
 
 

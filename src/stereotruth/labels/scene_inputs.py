@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..align.aligned_pair import Alignment
 from ..align.label_uncertainty import LabelUncertainty
@@ -38,14 +37,12 @@ from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX
 from .crowns import CROWN_REACH_PX
 from .ground_in_view import blocks_in_view
-from .pair_window import MaskedImage
+from .pair_window import MaskedImage, PairWindow, read_patch
 from .right_view import Pair, seen_from
 from .view_geometry import PixelScale, Rays
-from .window_points import PointWindows
+from .window_points import Footprint, PointWindows
 
 log = logging.getLogger("stereotruth")
-
-DAYS = 256  # of the points of a scene that have a number: 8 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,19 +166,20 @@ class SceneInputs:
         return self.settings.recipe == "surface"
 
     @property
-    def images_window(self) -> int:
-        """Side in px of the window that both images must hold around a label; 1: its pixel."""
-        return 1 if self.on_surface else self.settings.window
-
-    @property
     def margin(self) -> int:
         """Pixels around a window whose points have a say in it."""
         if not self.on_surface:
             return 1  # the points' noise is pooled over 3 x 3 pixels
         # what may hide a crown, farther off than the plane and the noise of a pixel's own points
-        # reach, and what the images tell of a pixel, and of those around
-        reach = CROWN_REACH_PX + MEANS_PX + max(EVIDENCE_PX, self.settings.window // 2 + 1)
-        return reach + REASON_PX  # of changes
+        # reach; and what is uncertain beside a contour
+        return max(CROWN_REACH_PX, int(np.ceil(self.scale.spacing_px)) + 1) + 2
+
+    @property
+    def image_margin(self) -> int:
+        """Pixels around a window whose labels have a say in what its images tell: of a pixel, of
+        those around it, and of changes."""
+        around = max(EVIDENCE_PX, self.settings.window // 2 + 1)
+        return MEANS_PX + around + REASON_PX
 
     @property
     def has_masks(self) -> bool:
@@ -208,22 +206,6 @@ class SceneInputs:
     def stores(self) -> tuple[PointStore, ...]:
         """The points."""
         return open_stores(self.point_stores)
-
-    @cached_property
-    def days(self) -> NDArray[np.uint16]:
-        """Days of the points since 1970-01-01, in their order behind a 0 for not known.
-
-        The first 255 of them: points of further days count as of none.
-        """
-        every = np.concatenate([[0], *(store.days for store in self.stores)])
-        return np.unique(every)[:DAYS].astype(np.uint16)
-
-    @cached_property
-    def day_numbers(self) -> NDArray[np.uint8]:
-        """Index of each day [65536] in :attr:`days`."""
-        numbers = np.zeros(1 << 16, np.uint8)
-        numbers[self.days] = np.arange(self.days.size)
-        return numbers
 
     @cached_property
     def scale(self) -> PixelScale:
@@ -258,6 +240,30 @@ class SceneInputs:
         first = rows.start - margin, cols.start - margin
         shape = rows.stop - rows.start + 2 * margin, cols.stop - cols.start + 2 * margin
         return blocks_in_view(self.ground.blocks(footprint.around), self.pair.model, first, shape)
+
+    def points_window(
+        self, rows: slice, cols: slice, footprint: Footprint, around_px: int = 1
+    ) -> PairWindow:
+        """A window with its margin, and of the right image all that its points can be seen in; both
+        hold the square of ``around_px`` (odd) around a label."""
+        margin = self.margin
+        rows, cols = (slice(edge.start - margin, edge.stop + margin) for edge in (rows, cols))
+        x, y, height = (
+            grid.reshape(-1)
+            for grid in np.meshgrid(
+                np.linspace(cols.start - 1.0, cols.stop, 5),
+                np.linspace(rows.start - 1.0, rows.stop, 5),
+                [footprint.low, footprint.high],
+            )
+        )
+        model, (left, right) = self.pair.model, self.pair.images
+        x_right = model.ground_to_epipolar(*model.epipolar_to_ground(x, y, height), height)[2]
+        x_right = x_right[np.isfinite(x_right)]
+        more = 8  # px, for what is not linear in between
+        least, most = (x_right.min(), x_right.max()) if x_right.size else (0.0, 0.0)
+        there = slice(int(np.floor(least)) - more, int(np.ceil(most)) + more + 1)
+        patches = read_patch(left, rows, cols, around_px), read_patch(right, rows, there, around_px)
+        return PairWindow(rows, cols, margin, *patches)
 
 
 def _taken(

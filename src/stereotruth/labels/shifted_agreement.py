@@ -20,8 +20,7 @@ from ..core.numerics.box_max import box_max
 from ..epipolar.surface_windows import apart_from_steps, correlations, surface_mean, surface_means
 from ..epipolar.warping import values_in_row
 from ..epipolar.window_sums import BLOCK, Runs, wanted_runs
-from .pair_window import Detail, PairWindow
-from .pixel_labels import Labels
+from .pair_window import Detail, Labels, PairWindow
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
