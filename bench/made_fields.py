@@ -22,8 +22,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 
 from stereotruth.epipolar.image_noise import NoiseCurve, pair_noise
 from stereotruth.labels.change_evidence import LabelledWindow
-from stereotruth.labels.pair_window import PairWindow, read_patch
-from stereotruth.labels.pixel_labels import Labels
+from stereotruth.labels.pair_window import Labels, PairWindow, read_patch
 from stereotruth.labels.scene_inputs import SceneInputs
 
 Floats = NDArray[np.float64]

@@ -59,13 +59,20 @@ def label_window(scene: SceneInputs, rows: slice, cols: slice) -> tuple[Layers, 
     """
     if not scene.on_surface:
         return paper_layers(scene, rows, cols)
+    own, around = lidar_labels(scene, rows, cols), labels_around(scene, rows, cols)
+    if own is None or around is None:
+        return None
+    layers, counts = image_layers(scene, rows, cols, around)
+    return layers, np.concatenate([own[1], counts])
+
+
+def labels_around(scene: SceneInputs, rows: slice, cols: slice) -> LidarLabels | None:
+    """What the LiDAR decides in a window and ``scene.image_margin`` px around it; None without a
+    surface or points."""
     margin = scene.image_margin
     around = (slice(edge.start - margin, edge.stop + margin) for edge in (rows, cols))
-    by_lidar, own = lidar_labels(scene, *around), lidar_labels(scene, rows, cols)
-    if by_lidar is None or own is None:
-        return None
-    layers, counts = image_layers(scene, rows, cols, by_lidar[0])
-    return layers, np.concatenate([own[1], counts])
+    by_lidar = lidar_labels(scene, *around)
+    return None if by_lidar is None else by_lidar[0]
 
 
 def lidar_labels(scene: SceneInputs, rows: slice, cols: slice) -> tuple[LidarLabels, Counts] | None:
