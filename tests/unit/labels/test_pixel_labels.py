@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stereotruth.core.status import Status
-from stereotruth.labels.pair_window import PairWindow, read_patch
-from stereotruth.labels.pixel_labels import Labels, OwnLabels, OwnPoints, facet_labels
+from stereotruth.labels.pair_window import Labels, PairWindow, read_patch
+from stereotruth.labels.pixel_labels import OwnLabels, OwnPoints, facet_labels
 from stereotruth.labels.view_geometry import PixelScale
 from stereotruth.surface.raster import VISIBLE, SeenSurface
 from stereotruth.surface.scale import SurfaceScale, ground_cell
@@ -36,10 +36,13 @@ def test_points_that_passed_are_an_edge_unless_they_show_through(see_through) ->
     passed = np.zeros(shape, np.bool_)
     passed[2, 3] = True
     own = OwnLabels(
+        points - level,
         Labels(points, np.zeros((2, *shape)), zeros),
+        np.isfinite(points) & ~seen.bulging,
         OwnPoints(zeros, points, nothing),
         passed,
-        np.zeros(shape, np.int32),
+        zeros,
+        0,
     )
     left = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(12, 20), 1)
     right = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(0, 20), 1)
