@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.numerics.box_max import box_max
+from ..core.numerics.decision_trees import DecisionTrees
 from ..core.numerics.summed_area import summed_area
 from ..epipolar.surface_windows import (
     alike_correlation,
@@ -80,10 +81,11 @@ class LabelledWindow:
     surface_class: NDArray[np.uint8]
     noise: tuple[float, float]
 
-    @property
-    def surface(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    @cached_property
+    def surface(self) -> tuple[Singles, Singles]:
         """Disparity (px) [h, w] and its slope [2, h, w], which decide what belongs to a surface."""
-        return self.labels.disparity, self.labels.slope
+        disparity, slope = self.labels.disparity, self.labels.slope
+        return disparity.astype(np.float32), np.ascontiguousarray(slope, np.float32)
 
     @property
     def first_row(self) -> int:
@@ -180,15 +182,43 @@ class Evidence(NamedTuple):
     young: Singles
 
 
-def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
+# Figures that are there before windows are compared at other disparities, and the probability of a
+# change by these below which nothing more is asked.
+FIRST = ("close", "close_most", "close_least", "close_mean")
+FIRST += ("difference", "difference_beside", "difference_near")
+FIRST += ("from_step", "slope", "vegetation", "young")
+ASKED_FROM = 0.01
+
+
+def change_evidence(
+    compared: LabelledWindow, first: DecisionTrees | None = None
+) -> tuple[Bools, Evidence]:
     """Which labelled pixels [h, w] of a window do not agree closely or show trees, and the evidence
-    of these."""
+    of these.
+
+    ``first``: trees that ask the figures of FIRST; pixels of which these say that a change is less
+    probable than ASKED_FROM are left out before the others are asked for.
+    """
     with_noise, expected = compared.correlation(CLOSE_PX)
     close = np.minimum(with_noise / expected, np.float32(1.0))
     close_mean = surface_mean(close, *compared.surface, 1, 1, wanted_runs(compared.labelled))
     doubtful = compared.labelled & ~(close_mean > AGREED)
     # What has replaced a tree may agree closely.
     doubtful |= compared.labelled & (compared.vegetation | compared.young)
+    known = {
+        "close": close,
+        "close_most": box_max(np.nan_to_num(close, nan=-1.0), 1),
+        "close_least": -box_max(np.nan_to_num(-close, nan=-1.0), 1),
+        "close_mean": close_mean,
+        **_differences(compared, doubtful),
+        "from_step": _from_step(compared.clear),
+        "slope": np.abs(compared.labels.slope).sum(axis=0),
+        "vegetation": compared.vegetation,
+        "young": compared.young,
+    }
+    if first is not None and doubtful.any():
+        features = np.stack([known[name][doubtful].astype(np.float32) for name in FIRST])
+        doubtful[doubtful] = first.sum_at(features) > np.log(ASKED_FROM / (1.0 - ASKED_FROM))
     detail = shifted_agreement(
         compared.labels,
         compared.window,
@@ -202,31 +232,24 @@ def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
     alike = alike_correlation(
         *compared.images, compared.brightness, *compared.surface, ALIKE_PX, compared.noise, runs
     )
+    around = surface_mean(alike, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful))
     arrays = Evidence(
-        close,
-        box_max(np.nan_to_num(close, nan=-1.0), 1),
-        -box_max(np.nan_to_num(-close, nan=-1.0), 1),
-        close_mean,
-        *_differences(compared, doubtful),
-        detail.here,
-        detail.elsewhere,
-        np.abs(detail.shift),
-        detail.signal,
-        detail.here_far,
-        detail.elsewhere_far,
-        alike,
-        surface_mean(alike, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful)),
-        *_contrasts_and_gain(compared, doubtful),
-        _from_step(compared.clear),
-        _apart(compared, doubtful),
-        np.abs(compared.labels.slope).sum(axis=0),
-        compared.vegetation,
-        compared.young,
+        agreement=detail.here,
+        elsewhere=detail.elsewhere,
+        shift=np.abs(detail.shift),
+        signal=detail.signal,
+        agreement_far=detail.here_far,
+        elsewhere_far=detail.elsewhere_far,
+        alike=alike,
+        alike_around=around,
+        apart=_apart(compared, doubtful),
+        **_contrasts_and_gain(compared, doubtful),
+        **known,
     )
     return doubtful, Evidence(*(array[doubtful].astype(np.float32) for array in arrays))
 
 
-def _differences(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
+def _differences(compared: LabelledWindow, doubtful: Bools) -> dict[str, Singles]:
     """By how much the left image differs from the right one [h, w], whose brightness is brought to
     that of the surface up to GAIN_PX, in standard deviations; and means of that."""
     left, warped = compared.images
@@ -243,13 +266,13 @@ def _differences(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
         off = np.abs(left - warped * (levels[0] / levels[1])) / np.sqrt(variance)
     difference = np.where(known, off, np.nan).astype(np.float32)
     runs = wanted_runs(doubtful)
-    return [
-        difference,
-        *(surface_mean(difference, *compared.surface, reach, 1, runs) for reach in (1, NEAR_PX)),
-    ]
+    beside, near = (
+        surface_mean(difference, *compared.surface, reach, 1, runs) for reach in (1, NEAR_PX)
+    )
+    return {"difference": difference, "difference_beside": beside, "difference_near": near}
 
 
-def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
+def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> dict[str, Singles]:
     """Contrast of both images, and how their ratio differs from that around [h, w]."""
     runs = wanted_runs(doubtful)
     left, warped = compared.images
@@ -263,7 +286,8 @@ def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singl
         contrasts.append(np.sqrt(spread / max(variance, ROUNDING)) * np.exp(level) * LEVEL)
     ratio = logarithms[0] - logarithms[1]
     wide = surface_mean(ratio, *compared.surface, GAIN_PX, GAIN_PX // 4, runs, compared.first_row)
-    return [*contrasts, np.abs(means[0] - means[1] - wide)]
+    gain = np.abs(means[0] - means[1] - wide)
+    return {"contrast_left": contrasts[0], "contrast_right": contrasts[1], "gain": gain}
 
 
 def _apart(compared: LabelledWindow, doubtful: Bools) -> Singles:

@@ -39,7 +39,7 @@ Z_LIMIT = 0.999
 SHIFTED_PX = 52  # by which these, and what their windows take in, reach beyond a pixel's match
 FAR = 2  # times as far off more of the surface is asked, which noise hides less
 AT_ONCE = 11  # shifts that are worked on together: which pixels count is the same for all
-TILE_PX = 256  # side of the parts of a window that are worked on as far as any of it is wanted
+TILE_PX = 512  # side of the parts of a window that are worked on as far as any of it is wanted
 
 
 @dataclass(frozen=True, eq=False)
