@@ -4,7 +4,7 @@ Every point is projected into both rectified images, and a pixel of the left epi
 label d = x_left - x_right (px) of what it shows, by one of two recipes (``project.recipe``): see
 :mod:`.recipe` and :mod:`.paper_recipe`. A point belongs to the pixel (floor(x_left + 0.5),
 floor(y_left + 0.5)). The right image's labels are those of the mirrored pair, see
-:mod:`.right_view`.
+:mod:`.view_geometry`.
 
 The grid is worked on in blocks of one shard: what the LiDAR decides of each, then what the images
 tell of it by the labels of this block and those beside it. The result has the same bytes for any
@@ -37,12 +37,10 @@ from ..core.status import Status, carries_label, is_labelled
 from ..epipolar.model import EpipolarModel
 from ..lidar.overlap_check import apart, refuse_apart
 from .change_evidence import Evidence
-from .layers import layers
-from .lidar_layers import LidarLabels
-from .lidar_read import lidar_read
+from .layers import LidarLabels, layers
 from .pair_window import MaskedImage
 from .recipe import image_layers, label_window, lidar_labels
-from .scene_inputs import SceneInputs
+from .scene_inputs import SceneInputs, lidar_read
 
 log = logging.getLogger("stereotruth")
 

@@ -6,7 +6,7 @@ LiDAR decides (:func:`lidar_labels`) follows from what lies close to a pixel, wh
 
 1. *Facets.* The surface of the points has been made for all pairs of the site: facets, and
    triangles that are undecided (:mod:`stereotruth.surface.surface`). Those are taken that the
-   window may see (:mod:`.ground_in_view`).
+   window may see (:mod:`.window_points`).
 2. *Visibility.* Facets and the prisms over undecided triangles are rasterised into the left view,
    and each pixel's position in the right image is tested against them
    (:mod:`stereotruth.surface.raster`). A pixel has the label of its nearest facet if nothing may
@@ -38,14 +38,13 @@ from .change_evidence import NO_NOISE, LabelledWindow, beyond_counts
 from .change_probability import MEANS_PX, contradicted
 from .change_reasons import REASON_PX, ChangedSurface, reasons_of
 from .crowns import crowns, with_crowns, without_contours
-from .ground_in_view import ground_in_view
-from .layers import layers_of
-from .lidar_layers import LidarLabels
+from .layers import LidarLabels, layers_of
 from .pair_window import MaskedImage, PairWindow, merged_status, read_patch
 from .paper_recipe import paper_layers
 from .pixel_labels import facet_labels, own_labels
 from .scene_inputs import SceneInputs
 from .shifted_agreement import SHIFTED_PX
+from .window_points import ground_in_view
 
 Counts = NDArray[np.int64]
 Layers = dict[str, NDArray]
