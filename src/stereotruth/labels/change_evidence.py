@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.numerics.box_max import box_max
-from ..core.numerics.decision_trees import DecisionTrees
 from ..core.numerics.summed_area import summed_area
 from ..epipolar.surface_windows import (
     alike_correlation,
@@ -182,23 +181,9 @@ class Evidence(NamedTuple):
     young: Singles
 
 
-# Figures that are there before windows are compared at other disparities, and the probability of a
-# change by these below which nothing more is asked.
-FIRST = ("close", "close_most", "close_least", "close_mean")
-FIRST += ("difference", "difference_beside", "difference_near")
-FIRST += ("from_step", "slope", "vegetation", "young")
-ASKED_FROM = 0.01
-
-
-def change_evidence(
-    compared: LabelledWindow, first: DecisionTrees | None = None
-) -> tuple[Bools, Evidence]:
+def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
     """Which labelled pixels [h, w] of a window do not agree closely or show trees, and the evidence
-    of these.
-
-    ``first``: trees that ask the figures of FIRST; pixels of which these say that a change is less
-    probable than ASKED_FROM are left out before the others are asked for.
-    """
+    of these."""
     with_noise, expected = compared.correlation(CLOSE_PX)
     close = np.minimum(with_noise / expected, np.float32(1.0))
     close_mean = surface_mean(close, *compared.surface, 1, 1, wanted_runs(compared.labelled))
@@ -216,9 +201,6 @@ def change_evidence(
         "vegetation": compared.vegetation,
         "young": compared.young,
     }
-    if first is not None and doubtful.any():
-        features = np.stack([known[name][doubtful].astype(np.float32) for name in FIRST])
-        doubtful[doubtful] = first.sum_at(features) > np.log(ASKED_FROM / (1.0 - ASKED_FROM))
     detail = shifted_agreement(
         compared.labels,
         compared.window,

@@ -61,10 +61,9 @@ def _log_odds(probability: NDArray[np.floating]) -> Singles:
 
 @cache
 def trees(diachronic: bool) -> list[DecisionTrees]:
-    """Those of the log odds by a pixel's own evidence, those that ask its surroundings, too, and
-    the first, by which pixels are asked at all.
+    """Those of the log odds by a pixel's own evidence, and those that ask its surroundings, too.
 
-    ``diachronic``: whether the images share no light. The table has those of either by turns.
+    ``diachronic``: whether the images share no light. The table has both of either by turns.
     """
     return DecisionTrees.load(TREES)[diachronic::2]
 
@@ -80,7 +79,7 @@ class ChangeProbability(NamedTuple):
 
 def change_probability(compared: LabelledWindow, diachronic: bool) -> ChangeProbability:
     """Of a window; ``diachronic``: whether the images share no light."""
-    doubtful, evidence = change_evidence(compared, trees(diachronic)[2])
+    doubtful, evidence = change_evidence(compared)
     return probability_by_evidence(compared, doubtful, np.stack(evidence), diachronic)
 
 
@@ -88,7 +87,7 @@ def probability_by_evidence(
     compared: LabelledWindow, doubtful: Bools, evidence: Singles, diachronic: bool
 ) -> ChangeProbability:
     """The same, by the ``evidence`` [k, n] of the ``doubtful`` pixels [h, w]."""
-    by_own, with_others, _ = trees(diachronic)
+    by_own, with_others = trees(diachronic)
     out = ChangeProbability(np.full(doubtful.shape, UNCHANGED), np.zeros(doubtful.shape, np.uint32))
     out.probability[doubtful] = probability_by(by_own, evidence)
     others = with_surroundings(out.probability, doubtful, compared)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.box_max import box_max
 from ..core.status import Status
 from ..epipolar.window_sums import SURFACE_PX
 from ..lidar.lattice import PER_M
@@ -47,10 +48,10 @@ FEW = 3  # degrees of freedom below which the points' own spread says nothing
 RIDGE = 0.1  # px², keeps planes through positions in a line level across it
 # Points farther apart than this, px, show what lies lower between them.
 SEEN_THROUGH_PX = 1.25
-# What is added up of a pixel's points. Of those on its surface: their number, steps from the centre
-# along x and y, steps above the surface and these squared, height (lattice steps) and class of the
-# highest in one number. Then the number of all in both frames, and of those below the surface.
-COUNT, ALONG, DOWN, LIFT, SQUARE, TOP, IN_FRAMES, LOWER = range(8)
+# What is added up of a pixel's points. Of those on its surface: their number; sums and products of
+# their steps from the centre along x and y and above the surface; height (lattice steps) and class
+# of the highest in one number. Then the number of all in both frames, and of those below.
+COUNT, X, Y, Z, XX, XY, YY, XZ, YZ, ZZ, TOP, IN_FRAMES, LOWER = range(13)
 NO_TOP = -(1 << 62)
 
 
@@ -70,7 +71,7 @@ class _Frames(NamedTuple):
 
 @kernel
 def _add(block: PointBlock, frames: _Frames, level: Floats, slope: Floats, sums: Ints) -> int:
-    """Adds points to the ``sums`` [pixels, 8]; returns how many lie in the window, without its
+    """Adds points to the ``sums`` [pixels, 13]; returns how many lie in the window, without its
     margin, and not in both frames.
 
     On the surface lies what is within SURFACE_PX of the disparity ``level`` [pixels] and ``slope``
@@ -118,12 +119,17 @@ def _add(block: PointBlock, frames: _Frames, level: Floats, slope: Floats, sums:
         u, v = u - (col << BITS), v - (row << BITS)
         lift = np.rint(disparity - level[p] * PX - slope[0, p] * u - slope[1, p] * v)
         if abs(lift) <= SURFACE_PX * PX:
-            steps = np.int64(lift)
+            z = np.int64(lift)
             sums[p, COUNT] += 1
-            sums[p, ALONG] += u
-            sums[p, DOWN] += v
-            sums[p, LIFT] += steps
-            sums[p, SQUARE] += steps * steps
+            sums[p, X] += u
+            sums[p, Y] += v
+            sums[p, Z] += z
+            sums[p, XX] += u * u
+            sums[p, XY] += u * v
+            sums[p, YY] += v * v
+            sums[p, XZ] += u * z
+            sums[p, YZ] += v * z
+            sums[p, ZZ] += z * z
             sums[p, TOP] = max(sums[p, TOP], top)
         elif lift < 0.0:
             sums[p, LOWER] += 1
@@ -131,17 +137,33 @@ def _add(block: PointBlock, frames: _Frames, level: Floats, slope: Floats, sums:
 
 
 @kernel
-def _means(sums: Ints, least: int, valid: Bools, means: Floats, squares: Floats) -> None:
+def _means(sums: Ints, least: int, valid: Bools, means: Floats) -> None:
     """Of pixels with ``least`` points on a surface: ``means`` [3, pixels], px from the centre along
-    x and y and above the surface; sums of ``squares`` (px²) about the last."""
+    x and y and above the surface; others are not ``valid``."""
     for p in range(valid.size):
         n = sums[p, COUNT]
         valid[p] &= n >= least
-        squares[p] = 0.0
         if valid[p]:
             for m in range(3):
-                means[m, p] = sums[p, ALONG + m] / n / PX
-            squares[p] = (sums[p, SQUARE] - sums[p, LIFT] * means[2, p] * PX) / (float(PX) * PX)
+                means[m, p] = sums[p, X + m] / n / PX
+
+
+@kernel
+def _residual_squares(sums: Ints, off: Floats, wanted: Bools, squares: Floats) -> None:
+    """Sums of squares (px²) of the points of the ``wanted`` pixels about a plane through their
+    mean, whose slope is ``off`` [2, pixels] that of the surface; 0 of others."""
+    square = float(PX) * PX
+    for p in range(wanted.size):
+        squares[p] = 0.0
+        if not wanted[p]:
+            continue
+        n, x, y, z = sums[p, COUNT], float(sums[p, X]), float(sums[p, Y]), float(sums[p, Z])
+        gx, gy = off[0, p], off[1, p]
+        rest = sums[p, ZZ] - z * z / n
+        rest -= 2.0 * (gx * (sums[p, XZ] - x * z / n) + gy * (sums[p, YZ] - y * z / n))
+        rest += gx * gx * (sums[p, XX] - x * x / n) + gy * gy * (sums[p, YY] - y * y / n)
+        rest += 2.0 * gx * gy * (sums[p, XY] - x * y / n)
+        squares[p] = max(rest, 0.0) / square
 
 
 @kernel
@@ -162,7 +184,7 @@ def _noise(
                     if valid[b, a]:
                         total += squares[b, a]
                         n += count[b, a] - 1
-            out[j, i] = max(max(total, 0.0) / n if n >= FEW else few, least)
+            out[j, i] = max(total / n if n >= FEW else few, least)
 
 
 def noise_variance(count: Ints, squares: Floats, valid: Bools, px_per_m: float) -> Floats:
@@ -177,10 +199,10 @@ def noise_variance(count: Ints, squares: Floats, valid: Bools, px_per_m: float) 
 @kernel
 def _planes(
     means: Floats, level: Floats, slopes: Floats, valid: Bools, wanted: Bools, label: Floats,
-    slope: Floats, variance: Floats,
+    slope: Floats, spread: Floats,
 ) -> None:  # fmt: skip
     """Labels at the centres of the ``wanted`` pixels [h, w] by planes through the means of points
-    up to 1 px around that lie on one surface; to the ``variance`` is added what the slopes'
+    up to 1 px around that lie on one surface; ``spread``: variance (px²) that the slopes'
     uncertainty brings. With fewer than four neighbours the slope is that of the facet."""
     rows, cols = valid.shape
     for j in range(rows):
@@ -225,7 +247,7 @@ def _planes(
             label[j, i] = here - gx * x - gy * y
             slope[0, j, i], slope[1, j, i] = gx, gy
             rest = max(szz - gx * suz - gy * svz, 0.0) / (n - 3)
-            variance[j, i] += rest * (x * x * svv - 2.0 * x * y * suv + y * y * suu) / det
+            spread[j, i] = rest * (x * x * svv - 2.0 * x * y * suv + y * y * suu) / det
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,9 +264,9 @@ class OwnPoints:
 class OwnLabels:
     """What each pixel's own points say, arrays [h, w].
 
-    ``lift`` (px) of their mean above the surface that the centre sees, NaN for none, and
-    ``variance`` (px²) of the mean; ``labels`` at the centres, of which only those are known that
-    are surer than the surface (``surer``); ``points`` that they follow from; ``passed``: two points
+    ``lift`` (px) of their mean above the surface that the centre sees, NaN for none; ``labels`` at
+    the centres, where they can be surer than the surface, and whether they are (``surer``);
+    ``points`` that they follow from; ``passed``: two points
     or more, all lower than the surface; ``in_frames``: number of points in both frames; ``outside``
     (one number): points of the window, without its margin, that are not in both.
     """
@@ -273,7 +295,7 @@ def own_labels(
     shape = window.shape
     level = np.where(seen.visibility == PRISM_IN_LEFT, np.nan, seen.disparity)
     slopes = np.ascontiguousarray(seen.slope)
-    sums = np.zeros((level.size, 8), np.int64)
+    sums = np.zeros((level.size, 13), np.int64)
     sums[:, TOP] = NO_TOP
     left, right = window.left, window.right
     origins = (left.row, left.col), (right.row, right.col)
@@ -282,18 +304,22 @@ def own_labels(
         _add(block, frames, level.reshape(-1), slopes.reshape(2, -1), sums) for block in blocks
     )
     count, in_frames = (sums[:, column].reshape(shape) for column in (COUNT, IN_FRAMES))
-    valid = np.isfinite(level)
-    means, squares = np.full((3, *shape), np.nan), np.empty(shape)
-    _means(sums, min_points, valid.reshape(-1), means.reshape(3, -1), squares.reshape(-1))
-    variance = noise_variance(count, squares, valid, px_per_m) / np.maximum(count, 1)
-    # only where these points can win: planes of all others are not asked for
-    with np.errstate(invalid="ignore"):
-        surer = (seen.visibility == VISIBLE) & ~seen.bulging & (variance <= seen.variance)
-    label, slope = np.full(shape, np.nan), slopes.copy()
-    _planes(means, level, slopes, valid, surer, label, slope, variance)
+    valid, means = np.isfinite(level), np.full((3, *shape), np.nan)
+    _means(sums, min_points, valid.reshape(-1), means.reshape(3, -1))
+    # only where these points can win, and beside it, where noise is taken from
+    least = (HEIGHT_NOISE_M * px_per_m) ** 2 / np.maximum(count, 1)
+    surer = valid & (seen.visibility == VISIBLE) & ~seen.bulging & (least <= seen.variance)
+    wanted = valid & box_max(surer, 1)
+    label, slope, squares = np.full(shape, np.nan), slopes.copy(), np.empty(shape)
+    spread = np.zeros(shape)
+    _planes(means, level, slopes, valid, wanted, label, slope, spread)
+    off = (slope - slopes).reshape(2, -1)
+    _residual_squares(sums, off, wanted.reshape(-1), squares.reshape(-1))
+    noise = noise_variance(count, squares, wanted, px_per_m)
+    variance = noise / np.maximum(count, 1) + spread
     with np.errstate(invalid="ignore"):
         surer &= variance <= seen.variance
-        lift = np.where(surer, label - level, means[2])
+        lift = np.where(wanted, label - level, means[2])
     top = sums[:, TOP].reshape(shape)
     points = OwnPoints(
         count.copy(),

@@ -116,28 +116,21 @@ class _Blocks:
                 parts["-".join(str(e.start // self.out.shard) for e in (kept, cols))] = kept, cols
         return parts
 
-    def lidar_key(self, block: Block) -> str:
-        """Digest of all that the LiDAR's part of a block follows from: ``content``, points and
-        surface."""
-        rows, here = block[0], self.scene.pair.cols(block[1])
-        points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(rows, here))
-        surface = [part.sha256 for part in self.scene.surface_blocks(rows, here)]
+    def key(self, block: Block, margin: int = 0) -> str:
+        """Digest of all that the LiDAR decides of a block and ``margin`` px around it by:
+        ``content``, points and surface."""
+        block = block[0], self.scene.pair.cols(block[1])
+        window = tuple(slice(edge.start - margin, edge.stop + margin) for edge in block)
+        points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(*window))
+        surface = [part.sha256 for part in self.scene.surface_blocks(*window)]
         return digest({"content": self.content, "points": points, "surface": surface})
-
-    def keys(self, blocks: Sequence[Block]) -> list[str]:
-        """Digest of all that the layers of each of the blocks follow from."""
-        if not self.scene.on_surface:
-            return [self.lidar_key(block) for block in blocks]
-        every = {str(near): near for block in blocks for near in self.around(block)}
-        parts = {name: self.lidar_key(near) for name, near in every.items()}
-        return [digest({"lidar": [parts[str(near)] for near in self.around(b)]}) for b in blocks]
 
     def make_lidar(self, name: str, block: Block) -> None:
         """Keep what the LiDAR decides of a block and the numbers of its points, if it is not there.
 
         No file, if the block has no points.
         """
-        ledger, file, key = Ledger(self.folder), self._file(name), self.lidar_key(block)
+        ledger, file, key = Ledger(self.folder), self._file(name), self.key(block)
         if ledger.find(name, key, {"labels": file}) is not None:
             return
         by_lidar = lidar_labels(self.scene, block[0], self.scene.pair.cols(block[1]))
@@ -360,7 +353,8 @@ def project_scene(
         rows = slice(part[0][0].start, part[-1][0].stop) if part else slice(0, 0)
         folder = unfinished.folder / "lidar" / str(strip or "all")
         job = _Blocks(inputs, unfinished, content, folder, rows)
-        keys = job.keys(part)
+        margin = inputs.image_margin if inputs.on_surface else 0
+        keys = [job.key(block, margin) for block in part]
         missing = [(keys[k], part[k]) for k in unfinished.missing(part, keys, workers)]
         tasks = job.tasks(missing)
         if tasks and inputs.on_surface:

@@ -88,7 +88,7 @@ def test_bytes_are_the_same_for_any_blocks_windows_and_workers(box, tmp_path):
     inputs = SceneInputs.of(*box.images, [store], LabelSettings())
     digests = set()
     for number, (blocks, run) in enumerate(
-        [(1, {}), (16, {"max_points": 20_000}), (3, {"workers": 2, "scheduler": "sync"})]
+        [(1, {}), (16, {"workers": 2}), (3, {"scheduler": "sync"})]
     ):
         folder = tmp_path / str(number)
         make_surface(

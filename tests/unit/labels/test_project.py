@@ -319,7 +319,7 @@ def test_all_bytes_are_the_same_in_any_order(box, tmp_path) -> None:
         [
             (first, {"workers": 1}),
             (first[::-1], {"workers": 2}),
-            (second, {"workers": 2, "max_points": 20_000}),
+            (second, {"workers": 2}),
             (second, {"scheduler": "sync"}),
         ]
     ):
