@@ -25,9 +25,7 @@ from ...synthetic.textured_fields import (
     ROWS,
     SHAPE,
     built,
-    ground,
     pair,
-    right_of,
     texture,
 )
 
@@ -55,19 +53,6 @@ def test_evidence_is_of_the_pixels_that_do_not_agree_fully() -> None:
     expected = 50.0 / np.sqrt(3.0) * np.sqrt(12.0)
     assert np.median(of_roof.contrast_left) == pytest.approx(expected, rel=0.1)
     assert np.median(of_roof.contrast_right) == pytest.approx(3.0 * expected, rel=0.1)
-
-
-def test_gain_is_what_brightness_differs_by_from_that_around() -> None:
-    left = ground(0)
-    right = right_of(left, np.full((160, 260), 4))
-    plain = evidence_of(pair(left, 2.0 * right))
-    assert not plain[0][INNER].any()
-    right[ROWS, slice(COLS.start - 4, COLS.stop - 4)][56:64, 71:79] *= 2.0 * ground(1)[:8, :8] / 500
-    doubtful, evidence = evidence_of(pair(left, right))
-    at = np.full(SHAPE, np.nan)
-    at[doubtful] = evidence.gain
-    share = 64 / 81  # of the means of 9 x 9 px, and of those up to 16 px off one in 81 every 4 px
-    assert at[59, 74] == pytest.approx(np.log(2.0) * (share - 4 / 81), abs=0.05)
 
 
 def test_evidence_is_the_same_in_any_window() -> None:

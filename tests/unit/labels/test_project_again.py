@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from stereotruth.core.products.files import sealed
 from stereotruth.core.products.grids import Strip, seal
 from stereotruth.lidar.point_store import ATTRIBUTES
 
-from ...synthetic.box_scene import Scene, alignment_of, project_with, write_image, write_points
+from ...synthetic.box_scene import Scene, alignment_of, project_with, write_points
 from ...synthetic.stores import tree
 
 
@@ -78,17 +77,6 @@ def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path)
     assert project(scene, [more, scene.store], other) == everything
     assert tree(out) == tree(other)
     assert project(scene, [scene.store], out) == touched  # and without the file again
-
-
-@pytest.mark.slow
-def test_other_images_settings_or_code_are_other_labels(scene, tmp_path):
-    out = tmp_path / "out.zarr"
-    everything = project(scene, [scene.store], out)
-    assert project(scene, [scene.store], out, min_points=3) == everything
-    left = zarr.open_group(scene.images[0], mode="r")["image"][:]
-    shutil.rmtree(scene.images[0])
-    name(write_image(scene.images[0], scene.model, np.maximum(left, 2) - 1), "another left image")
-    assert project(scene, [scene.store], out, min_points=3) == everything
 
 
 @pytest.mark.slow

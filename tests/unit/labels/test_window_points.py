@@ -41,15 +41,6 @@ def in_view(height_at) -> np.ndarray:
     return ground_in_view(found, 32.0 * PART, CELL, Leaning(), (80, 80), (40, 40)).squares
 
 
-def test_of_even_ground_it_is_the_window() -> None:
-    squares = in_view(lambda x, y: 0.0 * x)
-    assert squares.shape == (25, 25)
-    rows, cols = np.nonzero(squares)
-    assert (rows.min(), rows.max()) == (9, 15)  # 3 px more
-    assert cols.min() in range(7, 9) and cols.max() in range(16, 19)  # up to 19 px in the right
-    assert squares[9:16, 9:16].all()
-
-
 def test_a_tower_far_off_is_in_view() -> None:
     """500 steps of height move it by 50 px to the left, into the window."""
     flat = in_view(lambda x, y: 0.0 * x)
