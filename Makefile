@@ -6,6 +6,7 @@
 # make test           set up, then pass the tests that every change needs
 # make test-slow      set up, then pass the slow tests: whole runs, kills, draws, browsers, benchmarks, real scenes
 # make test-all       test and test-slow
+# make test-pythons   set up with the other Pythons that are here (3.12, 3.13), then pass the tests of what reads and writes files
 # make test-networks  set up with PyTorch, then pass the tests of the networks
 # make test-cluster   set up, then pass the test on a SLURM of its own (Debian, root)
 # make test-s3        set up, then pass the tests with object storage (a server of its own)
@@ -23,7 +24,7 @@ AT_ONCE := $(shell expr $(CORES) + 1)  # short tests: some wait for a server or 
 # Many processes run the same modules: each would compile anew what nobody may keep compiled.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup first-run first-city first-labels help docs networks test test-all test-slow test-networks test-s3 test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup first-run first-city first-labels help docs networks test test-all test-slow test-networks test-pythons test-s3 test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -75,7 +76,27 @@ networks: $(READY)
 	$(PIP) install --no-build-isolation -e '.[networks]'
 
 test-networks: networks
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/methods/networks tests/workflow/test_train.py
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) tests/unit/networks tests/workflow/test_train.py
+
+# Libraries of newer Pythons are newer, too: GDAL, PROJ, NumPy, zarr decide what files hold.
+OTHERS := 3.12 3.13
+FILE_TESTS := $(addprefix tests/unit/,core sensor epipolar lidar tiles)
+# The interpreter of a version, on the PATH or pyenv's; empty where there is none.
+interpreter = $(firstword $(shell python$(1) -c "import sys; print(sys.executable)" 2> /dev/null) $(wildcard $(HOME)/.pyenv/versions/$(1).*/bin/python))
+
+test-pythons: $(foreach version,$(OTHERS),$(if $(call interpreter,$(version)),test-python$(version),no-python$(version)))
+
+no-python%:
+	@echo "SKIPPED: the tests on Python $*, which this machine does not have"
+
+test-python%: .venv-%/ready
+	PATH="$(CURDIR)/.venv-$*/bin:$$PATH" pytest -n $(AT_ONCE) -m "not slow" $(FILE_TESTS)
+
+.venv-%/ready: $(READY)
+	$(call interpreter,$*) -m venv .venv-$*
+	$(BIN)/uv pip install --quiet --python .venv-$*/bin/python --require-hashes -r envs/requirements.lock
+	$(BIN)/uv pip install --quiet --python .venv-$*/bin/python --no-deps --no-build-isolation -e .
+	touch $@
 
 test-s3: $(READY)
 	PATH="$(CURDIR)/$(BIN):$$PATH" pytest tests/workflow/test_object_storage.py
