@@ -46,6 +46,7 @@ from .view_geometry import PixelScale
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Steps = NDArray[np.int32]
 
 # A pixel has no label if one up to HIGHER_REACH px off is higher by HIGHER_PX: a contour that
 # points determine to a pixel alone may cover it in either view.
@@ -59,6 +60,7 @@ CLEARANCE_PX, ABOVE_PX, BESIDE_PX = 2.0, 0.75, 12
 # and 1.32 for 1.88 %, and of the labels 0.19 for 0.22 % and 0.64 for 0.83 % off by more than 1 px.)
 LABELS_AROUND = 5
 CROWN_REACH_PX = BESIDE_PX + 2  # pixels around one that its label follows from
+SQUARE_BITS = 3  # squares of 8 px of the right image, in which crowns are or not
 # Standard uncertainty, px, where points are a pixel apart: of its own, and per px of residual, of
 # the triangle's rise, and of what is higher beside the pixel. It grows with the spacing of points
 # to the power of GROWTH.
@@ -222,6 +224,26 @@ def without_contours(
     return replace(labels, status=merged_status({Status.EDGE_IN_PIXEL: uncertain}, labels.status))
 
 
+@kernel
+def _near(
+    x: Floats, y: Floats, corner: Steps, first: tuple[int, int], squares: Bools, out: Bools
+) -> None:
+    """Which triangles' bounding boxes in the right image touch one of the ``squares``, of which
+    ``first`` is the (row, column) px of the first."""
+    rows, cols = squares.shape
+    for t in range(len(corner)):
+        a, b, c = corner[t]
+        top = (int(np.floor(min(y[a], y[b], y[c]))) - first[0]) >> SQUARE_BITS
+        bottom = (int(np.floor(max(y[a], y[b], y[c]))) - first[0]) >> SQUARE_BITS
+        if top >= rows or bottom < 0:
+            continue
+        left = (int(np.floor(min(x[a], x[b], x[c]))) - first[1]) >> SQUARE_BITS
+        right = (int(np.floor(max(x[a], x[b], x[c]))) - first[1]) >> SQUARE_BITS
+        for j in range(max(top, 0), min(bottom + 1, rows)):
+            for i in range(max(left, 0), min(right + 1, cols)):
+                out[t] |= squares[j, i]
+
+
 def _hidden_in_right(projected: ProjectedSurface, labelled: Bools, disparity: Floats) -> Bools:
     """Which pixels ``labelled`` [h, w] a facet, a triangle of the tops, or a strip between known
     surfaces hides from the right camera."""
@@ -230,7 +252,14 @@ def _hidden_in_right(projected: ProjectedSurface, labelled: Bools, disparity: Fl
     if row.size:
         surface = projected.surface
         pixels = right_pixels(row, col, disparity[row, col], projected.first)
-        corner = np.concatenate([surface.facet, surface.tops.corner])
+        # crowns are few: most facets are near none of them
+        column = np.floor(col + projected.first[1] - disparity[row, col]).astype(np.int64)
+        size = int(row.max()) >> SQUARE_BITS, (pixels.width - 1) >> SQUARE_BITS
+        squares = np.zeros((size[0] + 1, size[1] + 1), np.bool_)
+        squares[row >> SQUARE_BITS, column - pixels.first[1] >> SQUARE_BITS] = True
+        near = np.zeros(len(surface.facet), np.bool_)
+        _near(*projected.xy[2:], surface.facet, pixels.first, squares, near)
+        corner = np.concatenate([surface.facet[near], surface.tops.corner])
         hidden = projected.hidden_by_facets(corner, pixels)
         out[row, col] = hidden | projected.hidden_by_prisms(surface.strips, pixels)
     return out
