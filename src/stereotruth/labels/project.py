@@ -51,7 +51,8 @@ BLOCK = "block"  # begins the names of the tasks that make layers
 
 
 LEAST_LABELLED = 0.4  # of the pixels with points: below, a warning says what to check
-# Of a block, see :func:`.recipe.label_window`.
+# Of a block: points in the grid, in both frames, used; and of the recipe surface pixels of which
+# the images were asked, and of these the ones beyond what was learned by each figure.
 COUNTED = "in_grid", "in_frame", "used", "asked", *Evidence._fields
 # Share of the pixels that are asked which lies beyond what was learned by a figure of the evidence:
 # no simulated city and no real scene of those that trees are fitted to has more than 11 %.
@@ -152,7 +153,7 @@ class _Blocks:
         made = (
             self._layers(block) if self.scene.on_surface else label_window(self.scene, rows, here)
         )
-        arrays, counts = made or ({}, np.zeros(len(COUNTED), np.int64))
+        arrays, counts = made or ({}, np.zeros(0, np.int64))
         image = self.scene.pair.images[0]
         if made is None and isinstance(image, MaskedImage):
             masked = image.mask[rows, here] != 0
@@ -161,7 +162,9 @@ class _Blocks:
         shape = rows.stop - rows.start, here.stop - here.start
         status = arrays.get("status", np.zeros(shape, np.uint8))
         pixels = np.bincount(status.reshape(-1), minlength=len(Status))
-        self.out.write(block, key, arrays, [*pixels.tolist(), *counts.tolist()])
+        counted = np.zeros(len(COUNTED), np.int64)
+        counted[: counts.size] = counts
+        self.out.write(block, key, arrays, [*pixels.tolist(), *counted.tolist()])
 
     def _layers(self, block: Block) -> tuple[Mapping[str, NDArray], NDArray[np.int64]] | None:
         """Of a block, and what is COUNTED there; None without points."""

@@ -51,18 +51,12 @@ Layers = dict[str, NDArray]
 
 
 def label_window(scene: SceneInputs, rows: slice, cols: slice) -> tuple[Layers, Counts] | None:
-    """All layers of a window by itself and its counts; None if it has no points.
-
-    Counts: points in the window, in both frames, used; pixels of which the images were asked, and
-    of these the ones beyond what was learned by each figure of the evidence.
-    """
+    """All layers of a window by itself and its counts, see :func:`image_layers` and
+    :func:`.paper_layers`; None if it has no points."""
     if not scene.on_surface:
         return paper_layers(scene, rows, cols)
-    own, around = lidar_labels(scene, rows, cols), labels_around(scene, rows, cols)
-    if own is None or around is None:
-        return None
-    layers, counts = image_layers(scene, rows, cols, around)
-    return layers, np.concatenate([own[1], counts])
+    around = labels_around(scene, rows, cols)
+    return None if around is None else image_layers(scene, rows, cols, around)
 
 
 def labels_around(scene: SceneInputs, rows: slice, cols: slice) -> LidarLabels | None:
@@ -134,7 +128,11 @@ def image_layers(
     scene: SceneInputs, rows: slice, cols: slice, by_lidar: LidarLabels
 ) -> tuple[Layers, Counts]:
     """All layers of a window ``by_lidar``, whose labels reach ``scene.image_margin`` px farther, as
-    far as images agree; and the counts of :func:`label_window` from the third on."""
+    far as images agree.
+
+    Counts: points used; pixels of which the images were asked, and of these the ones beyond what
+    was learned by each figure of the evidence.
+    """
     window, labels = image_window(scene, rows, cols, by_lidar), by_lidar.labels
     # Reasons follow from changes up to REASON_PX off, these from probabilities up to MEANS_PX off,
     # and these from the agreement of the pixels beside. Labels farther off need no images.
