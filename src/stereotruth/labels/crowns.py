@@ -60,7 +60,7 @@ CLEARANCE_PX, ABOVE_PX, BESIDE_PX = 2.0, 0.75, 12
 # and 1.32 for 1.88 %, and of the labels 0.19 for 0.22 % and 0.64 for 0.83 % off by more than 1 px.)
 LABELS_AROUND = 5
 CROWN_REACH_PX = BESIDE_PX + 2  # pixels around one that its label follows from
-SQUARE_BITS = 3  # squares of 8 px of the right image, in which crowns are or not
+NEAR_BITS = 3  # squares of 8 px of the right image, in which crowns are or not
 # Standard uncertainty, px, where points are a pixel apart: of its own, and per px of residual, of
 # the triangle's rise, and of what is higher beside the pixel. It grows with the spacing of points
 # to the power of GROWTH.
@@ -233,12 +233,12 @@ def _near(
     rows, cols = squares.shape
     for t in range(len(corner)):
         a, b, c = corner[t]
-        top = (int(np.floor(min(y[a], y[b], y[c]))) - first[0]) >> SQUARE_BITS
-        bottom = (int(np.floor(max(y[a], y[b], y[c]))) - first[0]) >> SQUARE_BITS
+        top = (int(np.floor(min(y[a], y[b], y[c]))) - first[0]) >> NEAR_BITS
+        bottom = (int(np.floor(max(y[a], y[b], y[c]))) - first[0]) >> NEAR_BITS
         if top >= rows or bottom < 0:
             continue
-        left = (int(np.floor(min(x[a], x[b], x[c]))) - first[1]) >> SQUARE_BITS
-        right = (int(np.floor(max(x[a], x[b], x[c]))) - first[1]) >> SQUARE_BITS
+        left = (int(np.floor(min(x[a], x[b], x[c]))) - first[1]) >> NEAR_BITS
+        right = (int(np.floor(max(x[a], x[b], x[c]))) - first[1]) >> NEAR_BITS
         for j in range(max(top, 0), min(bottom + 1, rows)):
             for i in range(max(left, 0), min(right + 1, cols)):
                 out[t] |= squares[j, i]
@@ -254,9 +254,9 @@ def _hidden_in_right(projected: ProjectedSurface, labelled: Bools, disparity: Fl
         pixels = right_pixels(row, col, disparity[row, col], projected.first)
         # crowns are few: most facets are near none of them
         column = np.floor(col + projected.first[1] - disparity[row, col]).astype(np.int64)
-        size = int(row.max()) >> SQUARE_BITS, (pixels.width - 1) >> SQUARE_BITS
+        size = int(row.max()) >> NEAR_BITS, (pixels.width - 1) >> NEAR_BITS
         squares = np.zeros((size[0] + 1, size[1] + 1), np.bool_)
-        squares[row >> SQUARE_BITS, column - pixels.first[1] >> SQUARE_BITS] = True
+        squares[row >> NEAR_BITS, column - pixels.first[1] >> NEAR_BITS] = True
         near = np.zeros(len(surface.facet), np.bool_)
         _near(*projected.xy[2:], surface.facet, pixels.first, squares, near)
         corner = np.concatenate([surface.facet[near], surface.tops.corner])

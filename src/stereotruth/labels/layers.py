@@ -221,7 +221,7 @@ Block = tuple[slice, slice]
 
 
 class LidarLabels(NamedTuple):
-    """Labels of a window before its images are compared; arrays [h, w] of the types of LAYERS.
+    """Labels of a window before its images are compared; arrays [h, w] of the types of LIDAR_TYPES.
 
     Of :class:`.WindowLabels`: ``status``, ``disparity``, slope along x and y, ``variance``,
     ``height``, ``surface_class``, ``day``, ``point_count``. ``is_rough``: 1 where a rough surface
@@ -253,13 +253,13 @@ class LidarLabels(NamedTuple):
             labels.status, of_points.disparity, *of_points.slope, of_points.variance,
             labels.height, labels.surface_class, labels.day, count, is_rough, highest, classes,
         )  # fmt: skip
-        return cls(*(np.asarray(a, kind) for a, kind in zip(values, LAYERS.values())))
+        return cls(*(np.asarray(a, kind) for a, kind in zip(values, LIDAR_TYPES.values())))
 
     @classmethod
     def none(cls, shape: tuple[int, int]) -> LidarLabels:
         """Of pixels without points."""
         fill = {"f4": np.nan, "u1": 0, "u2": 0}
-        return cls(*(np.full(shape, fill[kind], kind) for kind in LAYERS.values()))
+        return cls(*(np.full(shape, fill[kind], kind) for kind in LIDAR_TYPES.values()))
 
     @property
     def labels(self) -> WindowLabels:
@@ -302,7 +302,7 @@ class LidarLabels(NamedTuple):
         return out
 
 
-LAYERS = dict(
+LIDAR_TYPES = dict(
     zip(
         LidarLabels._fields,
         ("u1", "f4", "f4", "f4", "f4", "f4", "u1", "u2", "u2", "u1", "f4", "u1"),

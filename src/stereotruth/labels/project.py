@@ -47,7 +47,7 @@ log = logging.getLogger("stereotruth")
 
 CHUNK = 256
 SHARD = 1024
-BLOCK = "block"  # begins the names of the tasks that make layers
+MAKES_LAYERS = "block"  # begins the names of such tasks
 
 
 LEAST_LABELLED = 0.4  # of the pixels with points: below, a warning says what to check
@@ -201,7 +201,7 @@ class _Blocks:
                 if name not in lidar:
                     lidar[name] = delayed(self.make_lidar, "lidar", part, name, part)
             after = [lidar[name] for name in parts]
-            tasks.append(delayed(self.make, BLOCK, block, key, block, after))
+            tasks.append(delayed(self.make, MAKES_LAYERS, block, key, block, after))
             for name in parts:
                 readers.setdefault(name, []).append(tasks[-1])
         for number, (name, after) in enumerate(readers.items()):
@@ -362,7 +362,7 @@ def project_scene(
         tasks = job.tasks(missing)
         if tasks and inputs.on_surface:
             _ = inputs.noise  # once, and not by each of the threads
-        with block_progress(len(missing), "disparity", BLOCK):
+        with block_progress(len(missing), "disparity", MAKES_LAYERS):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
         if strip is not None:
             return None
