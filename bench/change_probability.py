@@ -39,22 +39,25 @@ from real import Pair, Site
 from stereocities.truth import REASONS, TEXTURE
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.status import is_labelled
-from stereotruth.labels.change_evidence import Evidence, LabelledWindow, change_evidence
+from stereotruth.labels.change_evidence import (
+    LEARNED,
+    Evidence,
+    LabelledWindow,
+    change_evidence,
+    learned,
+)
 from stereotruth.labels.change_probability import (
     CHANGED,
     TREES,
     UNCHANGED,
+    least_probability,
     probability_by,
     probability_by_evidence,
     trees,
     with_surroundings,
 )
-from stereotruth.labels.crowns import with_crowns
 from stereotruth.labels.decision_trees import LEAF, DecisionTrees
-from stereotruth.labels.image_agreement import least_probability
-from stereotruth.labels.learned_evidence import LEARNED, learned
-from stereotruth.labels.recipe import lidar_labels
-from stereotruth.labels.window_points import read_window
+from stereotruth.labels.recipe import image_window, labels_around
 from stereotruth.lidar.point_store import WATER_CLASS
 from stereotruth.sensor.image_noise import EQUAL
 
@@ -134,8 +137,8 @@ class City:
         """The whole of it, and what is true there."""
         inputs = inputs_of(self.case, folder)
         rows, cols = (slice(0, side) for side in inputs.pair.model.shape)
-        by_lidar = lidar_labels(inputs, *read_window(inputs, rows, cols))
-        window, labels = by_lidar.window, by_lidar.labels
+        by_lidar = labels_around(inputs, rows, cols)
+        window, labels = image_window(inputs, rows, cols, by_lidar), by_lidar.labels
         truth, changes = dated_truth(self.case, folder)
         changed, kept, hidden, texture, moved = np.zeros((5, *labels.status.shape), np.bool_)
         for out, pixels in zip((changed, kept, hidden), changed_and_kept(truth, changes)):
@@ -143,7 +146,6 @@ class City:
         texture[window.inner] = changes["reason"] == TEXTURE
         moved[window.inner] = changes["reason"] == MOVED
         rare = moved & changed & (not self.apart)
-        labels = with_crowns(labels, by_lidar.rough, window)
         labelled = is_labelled(labels.status) & (labels.surface_class != WATER_CLASS)
         noise = inputs.noise
         if self.eight_bits:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -24,9 +25,9 @@ from stereotruth.core.products.grids import Layer, require_complete
 from stereotruth.core.products.resumable_grids import resumable_grid
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify_image
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.paper_correlation import correlate
-from stereotruth.labels.pixel_points import Collection
+from stereotruth.labels.pair_window import PairWindow, read_patch
+from stereotruth.labels.paper_recipe import correlate, points_of
+from stereotruth.labels.window_points import PointBlock
 from stereotruth.lidar.point_store import Points, PointStore
 from stereotruth.lidar.smooth_maps import PatchedTransform
 from stereotruth.sensor.images import Source
@@ -130,15 +131,13 @@ def correlation(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         across = xy[2, inside]
         reach = slice(int(across.min()) - 1, int(across.max()) + 2)
         patches = [read_patch(image, rows, c, 9) for image, c in zip(images, (cols, reach))]
-        origin = int(points.lon_q.min()), int(points.lat_q.min())
-        collection = Collection((512, 1024), (rows.start, cols.start), origin, *patches)
-        names = "lon_q", "lat_q", "h_q", "classification"
+        names = "lon_q", "lat_q", "h_q", "classification", "day"
         attributes = [getattr(points, name)[inside] for name in names]
-        day = np.zeros_like(attributes[-1])
-        collection.add(*attributes, day, np.ascontiguousarray(xy[:, inside]))
-        found = collection.sorted()
-        windows.append((found, np.ones(found.points.size, np.bool_), *patches, 9))
-    count = sum(window[1].size for window in windows)
+        block = PointBlock(*attributes, np.ascontiguousarray(xy[:, inside]))
+        ground = SimpleNamespace(blocks=lambda block=block: [block])
+        in_frames, _ = points_of(ground, PairWindow(rows, cols, 0, *patches))
+        windows.append((in_frames, *patches, 9))
+    count = sum(window[0].x.size for window in windows)
     rows = []
     for threads in (1, 2)[: arguments.workers]:
         with ThreadPoolExecutor(threads) as pool:

@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from stereotruth.labels.change_evidence import LabelledWindow
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow
-from stereotruth.labels.pixel_labels import Labels
+from stereotruth.labels.pair_window import Labels, PairWindow, read_patch
 from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.sensor.image_noise import NoiseCurve, pair_noise
 

@@ -34,13 +34,10 @@ from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.files import atomic_folder
 from stereotruth.core.status import Status, is_labelled
 from stereotruth.labels.change_evidence import LabelledWindow
-from stereotruth.labels.change_probability import change_probability
-from stereotruth.labels.crowns import with_crowns
-from stereotruth.labels.image_agreement import least_probability
+from stereotruth.labels.change_probability import change_probability, least_probability
 from stereotruth.labels.pair_window import PairWindow, WindowLabels
-from stereotruth.labels.recipe import lidar_labels
+from stereotruth.labels.recipe import image_window, labels_around
 from stereotruth.labels.scene_inputs import SceneInputs
-from stereotruth.labels.window_points import read_window
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.point_store import WATER_CLASS
 from stereotruth.sensor.image_noise import EQUAL
@@ -359,8 +356,8 @@ class Planted(NamedTuple):
 
 def _by_lidar(inputs: SceneInputs) -> tuple[PairWindow, WindowLabels]:
     rows, cols = (slice(0, side) for side in inputs.pair.model.shape)
-    found = lidar_labels(inputs, *read_window(inputs, rows, cols))
-    return found.window, with_crowns(found.labels, found.rough, found.window)
+    by_lidar = labels_around(inputs, rows, cols)
+    return image_window(inputs, rows, cols, by_lidar), by_lidar.labels
 
 
 def by_matching(window: PairWindow, disparity: Floats) -> tuple[Bools, Bools]:

@@ -40,7 +40,6 @@ from stereotruth.epipolar.warping import warp_rows
 from stereotruth.evaluate.labels_against_images import warp_scene
 from stereotruth.labels.recipe import lidar_labels
 from stereotruth.labels.scene_inputs import SceneInputs
-from stereotruth.labels.window_points import read_window
 from stereotruth.sensor.rpc import RPC, SensorModel
 from stereotruth.tiles.sift_matches import match_tile
 from stereotruth.tiles.tile_checks import WarpedTile
@@ -212,11 +211,9 @@ class Pair:
             surface=next(surface),
         )
         rows, cols = (slice(0, side) for side in inputs.pair.model.shape)
-        found = lidar_labels(inputs, *read_window(inputs, rows, cols))
-        inner, labels = found.window.inner, found.labels
-        known = is_labelled(labels.status)[inner]
-        disparity = np.where(known, labels.labels.disparity[inner], np.nan)
-        return disparity, labels.surface_class[inner]
+        labels, _ = lidar_labels(inputs, rows, cols)
+        by_facets = is_labelled(labels.status) & (labels.status != Status.LABELLED_CROWN)
+        return np.where(by_facets, labels.disparity, np.nan), labels.surface_class
 
     def figures(self) -> dict[str, Any]:
         """All that the tables show."""

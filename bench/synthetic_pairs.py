@@ -36,7 +36,7 @@ from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.evaluate.epipolar_truth import truth_window
 from stereotruth.evaluate.labels_against_truth import Truth
-from stereotruth.labels.project import MAX_POINTS, SHARD, project_scene
+from stereotruth.labels.project import SHARD, project_scene
 from stereotruth.labels.recipe import label_window
 from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
@@ -414,12 +414,10 @@ class Block:
     def windows(self, job: SceneInputs) -> list[tuple[slice, slice]]:
         """Of the blocks of stage project, as far as they lie in this one, as the pair sees them."""
         return [
-            window
-            for r in range(self.rows.start, self.rows.stop, SHARD)
-            for c in range(self.cols.start, self.cols.stop, SHARD)
-            for window in job.windows.parts(
+            (
                 slice(r, min(r + SHARD, self.rows.stop)),
                 job.pair.cols(slice(c, min(c + SHARD, self.cols.stop))),
-                MAX_POINTS,
             )
+            for r in range(self.rows.start, self.rows.stop, SHARD)
+            for c in range(self.cols.start, self.cols.stop, SHARD)
         ]

@@ -150,7 +150,7 @@ def write_points(
 
 
 PAIR = ("view", "alignment", "surface")
-RUN = ("code", "workers", "scheduler", "scene", "max_points", "strip")
+RUN = ("code", "workers", "scheduler", "scene", "strip")
 
 
 def project_with(left: Path, right: Path, stores: list[Path], out: Path, **options):

@@ -18,7 +18,7 @@ import numpy as np
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.status import Status
 from stereotruth.labels import recipe
-from stereotruth.labels.facet_labels import facet_labels
+from stereotruth.labels.pixel_labels import facet_labels
 
 from .box_scene import Scene
 
@@ -28,9 +28,7 @@ WRONG_SURFACE_PX = 1.0  # labels that are off by more are no matter of noise
 
 def of_facets(seen, own, *rest):
     """Labels of which no pixel's own points are the surer ones."""
-    unsure = np.full_like(own.labels.variance, np.inf)
-    own = replace(own, labels=replace(own.labels, variance=unsure))
-    return facet_labels(seen, own, *rest)
+    return facet_labels(seen, replace(own, surer=np.zeros_like(own.surer)), *rest)
 
 
 def row(scene: Scene, name: str, how) -> str:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow
-from stereotruth.labels.pixel_labels import Labels
+from stereotruth.labels.pair_window import Labels, PairWindow, read_patch
 
 ROWS, COLS = slice(20, 140), slice(60, 200)
 SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start

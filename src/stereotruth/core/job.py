@@ -155,14 +155,17 @@ def progress(items: Iterable, total: int, what: str) -> Iterator:
             log.info("%s: %d of %d", what, done, total)
 
 
-def block_progress(total: int, what: str) -> Any:
-    """A Dask callback that logs about every tenth of the blocks done (local schedulers only)."""
+def block_progress(total: int, what: str, name: str = "") -> Any:
+    """A Dask callback that logs about every tenth of the blocks done (local schedulers only);
+    tasks count whose key begins with ``name``."""
     from dask.callbacks import Callback  # most jobs do without Dask
 
     done = 0
 
-    def count(*_: object) -> None:
+    def count(key: object, *_: object) -> None:
         nonlocal done
+        if not str(key).startswith(name):
+            return
         done += 1
         if done * 10 // total > (done - 1) * 10 // total:
             log.info("%s: %d of %d blocks", what, done, total)

@@ -13,13 +13,14 @@ depend on blocks.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.numerics.windows import box_max
+from ..core.numerics.windows import box_max, summed_area
 from ..epipolar.surface_windows import (
     alike_correlation,
     apart_from_steps,
@@ -30,12 +31,12 @@ from ..epipolar.surface_windows import (
 )
 from ..epipolar.window_sums import wanted_runs
 from ..lidar.point_store import VEGETATION_CLASSES
-from .pair_window import PairWindow
-from .pixel_labels import Labels
+from .pair_window import Labels, PairWindow
 from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
-from .young_crowns import beside_young_crowns
 
+Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Bits = NDArray[np.uint32]
 Bools = NDArray[np.bool_]
 
 CLOSE_PX = 5  # side of the windows that see what is a few pixels wide
@@ -55,6 +56,15 @@ ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image'
 OFF_PX, OFF_SHARE = 0.1, 0.01
 
 
+# A crown of the LiDAR is a young one if so few pixels up to YOUNG_REACH_PX around show vegetation:
+# 2.4 m wide in pixels of 0.65 m. One that doubles covers 2 px around, and the optics blur it by
+# one.
+YOUNG_REACH_PX, YOUNG_PIXELS = 3, 14
+NO_NOISE = 0.0, 0.0
+ASKED = np.uint32(1)
+LEARNED = Path(__file__).with_suffix(".tsv")
+
+
 @dataclass(frozen=True, eq=False)
 class LabelledWindow:
     """A ``window`` of a pair whose images are compared by ``labels``; arrays [h, w].
@@ -69,10 +79,11 @@ class LabelledWindow:
     surface_class: NDArray[np.uint8]
     noise: tuple[float, float]
 
-    @property
-    def surface(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    @cached_property
+    def surface(self) -> tuple[Singles, Singles]:
         """Disparity (px) [h, w] and its slope [2, h, w], which decide what belongs to a surface."""
-        return self.labels.disparity, self.labels.slope
+        disparity, slope = self.labels.disparity, self.labels.slope
+        return disparity.astype(np.float32), np.ascontiguousarray(slope, np.float32)
 
     @property
     def first_row(self) -> int:
@@ -178,6 +189,17 @@ def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
     doubtful = compared.labelled & ~(close_mean > AGREED)
     # What has replaced a tree may agree closely.
     doubtful |= compared.labelled & (compared.vegetation | compared.young)
+    known = {
+        "close": close,
+        "close_most": box_max(np.nan_to_num(close, nan=-1.0), 1),
+        "close_least": -box_max(np.nan_to_num(-close, nan=-1.0), 1),
+        "close_mean": close_mean,
+        **_differences(compared, doubtful),
+        "from_step": _from_step(compared.clear),
+        "slope": np.abs(compared.labels.slope).sum(axis=0),
+        "vegetation": compared.vegetation,
+        "young": compared.young,
+    }
     detail = shifted_agreement(
         compared.labels,
         compared.window,
@@ -191,31 +213,24 @@ def change_evidence(compared: LabelledWindow) -> tuple[Bools, Evidence]:
     alike = alike_correlation(
         *compared.images, compared.brightness, *compared.surface, ALIKE_PX, compared.noise, runs
     )
+    around = surface_mean(alike, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful))
     arrays = Evidence(
-        close,
-        box_max(np.nan_to_num(close, nan=-1.0), 1),
-        -box_max(np.nan_to_num(-close, nan=-1.0), 1),
-        close_mean,
-        *_differences(compared, doubtful),
-        detail.here,
-        detail.elsewhere,
-        np.abs(detail.shift),
-        detail.signal,
-        detail.here_far,
-        detail.elsewhere_far,
-        alike,
-        surface_mean(alike, *compared.surface, ALIKE_PX, 1, wanted_runs(doubtful)),
-        *_contrasts_and_gain(compared, doubtful),
-        _from_step(compared.clear),
-        _apart(compared, doubtful),
-        np.abs(compared.labels.slope).sum(axis=0),
-        compared.vegetation,
-        compared.young,
+        agreement=detail.here,
+        elsewhere=detail.elsewhere,
+        shift=np.abs(detail.shift),
+        signal=detail.signal,
+        agreement_far=detail.here_far,
+        elsewhere_far=detail.elsewhere_far,
+        alike=alike,
+        alike_around=around,
+        apart=_apart(compared, doubtful),
+        **_contrasts_and_gain(compared, doubtful),
+        **known,
     )
     return doubtful, Evidence(*(array[doubtful].astype(np.float32) for array in arrays))
 
 
-def _differences(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
+def _differences(compared: LabelledWindow, doubtful: Bools) -> dict[str, Singles]:
     """By how much the left image differs from the right one [h, w], whose brightness is brought to
     that of the surface up to GAIN_PX, in standard deviations; and means of that."""
     left, warped = compared.images
@@ -232,13 +247,13 @@ def _differences(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
         off = np.abs(left - warped * (levels[0] / levels[1])) / np.sqrt(variance)
     difference = np.where(known, off, np.nan).astype(np.float32)
     runs = wanted_runs(doubtful)
-    return [
-        difference,
-        *(surface_mean(difference, *compared.surface, reach, 1, runs) for reach in (1, NEAR_PX)),
-    ]
+    beside, near = (
+        surface_mean(difference, *compared.surface, reach, 1, runs) for reach in (1, NEAR_PX)
+    )
+    return {"difference": difference, "difference_beside": beside, "difference_near": near}
 
 
-def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singles]:
+def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> dict[str, Singles]:
     """Contrast of both images, and how their ratio differs from that around [h, w]."""
     runs = wanted_runs(doubtful)
     left, warped = compared.images
@@ -252,7 +267,8 @@ def _contrasts_and_gain(compared: LabelledWindow, doubtful: Bools) -> list[Singl
         contrasts.append(np.sqrt(spread / max(variance, ROUNDING)) * np.exp(level) * LEVEL)
     ratio = logarithms[0] - logarithms[1]
     wide = surface_mean(ratio, *compared.surface, GAIN_PX, GAIN_PX // 4, runs, compared.first_row)
-    return [*contrasts, np.abs(means[0] - means[1] - wide)]
+    gain = np.abs(means[0] - means[1] - wide)
+    return {"contrast_left": contrasts[0], "contrast_right": contrasts[1], "gain": gain}
 
 
 def _apart(compared: LabelledWindow, doubtful: Bools) -> Singles:
@@ -267,3 +283,45 @@ def _from_step(clear: Bools) -> Singles:
     for px in range(FAR_PX - 1, -1, -1):
         out[box_max(~clear, px)] = px
     return out
+
+
+def beside_young_crowns(surface_class: NDArray[np.uint8]) -> Bools:
+    """Pixels [h, w] no more than YOUNG_REACH_PX from a crown of the LiDAR that is small, by the
+    ``surface_class`` [h, w] (ASPRS)."""
+    is_young = np.isin(surface_class, VEGETATION_CLASSES)
+    row, col = np.nonzero(is_young)
+    margin = 2 * YOUNG_REACH_PX
+    table = summed_area(np.pad(is_young, margin))
+
+    def count(px: int) -> NDArray[np.int64]:
+        """Of vegetation up to ``px`` around each of its pixels."""
+        top, side = row + margin - px, col + margin - px
+        end, far = top + 2 * px + 1, side + 2 * px + 1
+        return table[end, far] - table[top, far] - table[end, side] + table[top, side]
+
+    around = count(YOUNG_REACH_PX)
+    is_small = (around <= YOUNG_PIXELS) & (count(margin) <= 2 * YOUNG_PIXELS)
+    is_young[row, col] = is_small & (2 * count(1) >= around)  # compact, no branches of a canopy
+    return box_max(is_young, YOUNG_REACH_PX)
+
+
+@cache
+def learned(diachronic: bool) -> Floats:
+    """Lowest and greatest value [2, k] of each figure of the evidence that trees are fitted to, but
+    for one in a hundred at either end."""
+    rows = np.loadtxt(LEARNED, np.float64, delimiter="\t", skiprows=1, usecols=(1, 2, 3))
+    return rows[rows[:, 0] == diachronic, 1:].T
+
+
+def beyond_learned(evidence: Singles, diachronic: bool) -> Bits:
+    """Which of the figures of the ``evidence`` [k, n] lie beyond what has been learned [n]: the bit
+    ASKED, and from the next one on a bit for each figure."""
+    low, high = learned(diachronic)[..., None]
+    is_beyond = (evidence < low) | (evidence > high)  # false for NaN
+    return ASKED + (np.uint32(2) << np.arange(len(evidence), dtype=np.uint32)) @ is_beyond
+
+
+def beyond_counts(beyond: Bits) -> NDArray[np.int64]:
+    """Of pixels [h, w]: how many were asked, and how many lie beyond by each figure [1 + k]."""
+    figures = learned(False).shape[1]
+    return np.array([(beyond >> bit & 1).sum(dtype=np.int64) for bit in range(1 + figures)])

@@ -19,10 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..epipolar.surface_windows import alike_mean, surface_mean
-from ..epipolar.window_sums import wanted_runs
-from .change_evidence import LabelledWindow, change_evidence
+from ..epipolar.window_sums import SURFACE_PX, wanted_runs
+from .change_evidence import LabelledWindow, beyond_learned, change_evidence
 from .decision_trees import DecisionTrees
-from .learned_evidence import beyond_learned
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -101,3 +100,33 @@ def probability_by_evidence(
 def probability_by(fitted: DecisionTrees, features: Singles) -> Floats:
     """By trees that sum up to log odds, of the ``features`` [k, n], evidence first."""
     return 1.0 / (1.0 + np.exp(-fitted.sum_at(features).astype(np.float64)))
+
+
+class Contradicted(NamedTuple):
+    """What the images of a window say of its labels; arrays [h, w].
+
+    ``changed``: where they contradict these; ``variance`` (px²) of labels that they do not
+    contradict, though these may have changed; ``beyond``: see :class:`ChangeProbability`.
+    """
+
+    changed: Bools
+    variance: Floats | float
+    beyond: NDArray[np.uint32]
+
+
+def least_probability(compared: LabelledWindow) -> Floats:
+    """Of a change, more than which leaves a pixel [h, w] without a label."""
+    by_ground = np.where(compared.young, YOUNG_CHANGED, CHANGED)
+    return np.where(compared.vegetation, CROWN_CHANGED, by_ground)
+
+
+def contradicted(compared: LabelledWindow, diachronic: bool) -> Contradicted:
+    """Which labelled pixels [h, w] the images contradict.
+
+    Labels of images of one light count as right where these do not contradict them; of images that
+    share no light (``diachronic``) they may have changed.
+    """
+    probability, beyond = change_probability(compared, diachronic)
+    changed = compared.labelled & (probability > least_probability(compared))
+    variance = probability * SURFACE_PX**2 if diachronic else 0.0
+    return Contradicted(changed, variance, beyond)

@@ -17,7 +17,7 @@ no block changes it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,12 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.numerics.windows import box_max, window_sums
-from ..core.status import Reason, Status
+from ..core.status import Reason
 from ..lidar.point_store import VEGETATION_CLASSES, WATER_CLASS
-from .change_evidence import WINDOW_PX
-from .image_agreement import Comparison
-from .pair_window import PairWindow, WindowLabels
-from .pixel_labels import OwnPoints
+from .change_evidence import WINDOW_PX, LabelledWindow
 from .shifted_agreement import WIDE_SHIFTS_PX, shifted_agreement
 
 Floats = NDArray[np.float64]
@@ -85,20 +82,21 @@ class ChangedSurface:
     """What the LiDAR shows at the pixels of a window, arrays [h, w].
 
     ``changed``; ``height`` (m) and ``surface_class`` (ASPRS) of the surface; ``is_rough``: whether
-    it is a rough surface; ``own``: the points in each pixel.
+    it is a rough surface. Of the points in each pixel ``highest`` (m, NaN for none) and its class.
     """
 
     changed: Bools
     height: Floats
     surface_class: Bytes
     is_rough: Bools
-    own: OwnPoints
+    highest: NDArray[np.floating]
+    highest_class: Bytes
 
     @cached_property
     def classes(self) -> Bytes:
         """The surface's class [h, w]; without one, by its roughness and height over the lowest
         point around."""
-        lowest = -box_max(np.where(self.own.count > 0, -self.own.highest, -np.inf), AROUND_PX)
+        lowest = -box_max(np.fmax(-self.highest, -np.inf), AROUND_PX)
         is_high = self.height - lowest > VEHICLE_M
         by_height = np.where(is_high, BUILDING_CLASS, GROUND_CLASS)
         by_height = np.where(self.is_rough, TREE_CLASS, by_height)
@@ -116,10 +114,9 @@ def evidence_of(
 ) -> Evidence:
     """From the ``surface`` of the LiDAR, the ``shift`` (px) [h, w] at which the images agree better
     (NaN for none), and the disparity of a metre of height; ``diachronic``: of two lights."""
-    changed, own = surface.changed, surface.own
-    classes = np.where(own.count > 0, own.surface_class, 0)
-    ground = -box_max(np.where(classes == GROUND_CLASS, -own.highest, -np.inf), AROUND_PX)
-    water = box_max(np.where(classes == WATER_CLASS, own.highest, -np.inf), AROUND_PX)
+    changed, highest, classes = surface.changed, surface.highest, surface.highest_class
+    ground = -box_max(np.where(classes == GROUND_CLASS, -highest, -np.inf), AROUND_PX)
+    water = box_max(np.where(classes == WATER_CLASS, highest, -np.inf), AROUND_PX)
     vegetation = box_count(np.isin(classes, VEGETATION_CLASSES), CROWN_PX) >= CROWN_PIXELS
     is_building = changed & (surface.classes == BUILDING_CLASS)
     share = box_count(changed, AROUND_PX) / (2 * AROUND_PX + 1) ** 2
@@ -196,32 +193,24 @@ def by_votes(reasons: Bytes, is_strong: Bools, evidence: Evidence) -> Bytes:
     return out
 
 
-def with_reasons(
-    labels: WindowLabels,
-    is_rough: Bools,
-    own: OwnPoints,
-    window: PairWindow,
-    comparison: Comparison,
-    px_per_m: float,
-) -> WindowLabels:
-    """Labels of a window with the reasons of its changed pixels.
+def reasons_of(
+    surface: ChangedSurface, compared: LabelledWindow, px_per_m: float, diachronic: bool
+) -> Bytes:
+    """Why the pixels [h, w] of a window have changed (:class:`.status.Reason`).
 
-    ``is_rough`` [h, w]: whether a pixel shows a rough surface; ``own``: its points; ``px_per_m``:
-    disparity of a metre of height.
+    ``px_per_m``: disparity of a metre of height; ``diachronic``: whether the images share no light.
     """
-    changed = labels.status == Status.CHANGED
+    changed, window = surface.changed, compared.window
     if not changed.any():
-        return labels
-    surface = ChangedSurface(changed, labels.height, labels.surface_class, is_rough, own)
+        return np.zeros(changed.shape, np.uint8)
     by_class = np.isin(surface.classes, (*VEGETATION_CLASSES, WATER_CLASS))
     votes = window.grown(REASON_PX)  # what votes has the votes' reach of its own
     asked = np.zeros_like(changed)
     asked[votes] = changed[votes] & ~by_class[votes]
     shifted = shifted_agreement(
-        labels.labels, window, comparison.noise, WINDOW_PX, TOGETHER_PX, asked,
-        WIDE_SHIFTS_PX,
-    )  # fmt: skip
+        compared.labels, window, compared.noise, WINDOW_PX, TOGETHER_PX, asked, WIDE_SHIFTS_PX
+    )
     agrees = shifted.is_shifted & (shifted.elsewhere > LEAST)
     shift = np.where(agrees, shifted.shift, np.float32(np.nan)).astype(np.float64)
-    evidence = evidence_of(surface, shift, px_per_m, comparison.diachronic)
-    return replace(labels, change=by_votes(*pixel_reasons(evidence), evidence))
+    evidence = evidence_of(surface, shift, px_per_m, diachronic)
+    return by_votes(*pixel_reasons(evidence), evidence)

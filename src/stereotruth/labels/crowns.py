@@ -39,13 +39,13 @@ from ..surface.raster import (
 )
 from ..surface.rough_tops import RoughTops
 from ..surface.scale import FACET_RESIDUAL_PX
-from .pair_window import PairWindow, WindowLabels
-from .pixel_labels import Labels
-from .pixel_scale import PixelScale
+from .pair_window import Labels, PairWindow, WindowLabels, merged_status
+from .view_geometry import PixelScale
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+Steps = NDArray[np.int32]
 
 # A pixel has no label if one up to HIGHER_REACH px off is higher by HIGHER_PX: a contour that
 # points determine to a pixel alone may cover it in either view.
@@ -59,6 +59,7 @@ CLEARANCE_PX, ABOVE_PX, BESIDE_PX = 2.0, 0.75, 12
 # and 1.32 for 1.88 %, and of the labels 0.19 for 0.22 % and 0.64 for 0.83 % off by more than 1 px.)
 LABELS_AROUND = 5
 CROWN_REACH_PX = BESIDE_PX + 2  # pixels around one that its label follows from
+NEAR_BITS = 3  # squares of 8 px of the right image, in which crowns are or not
 # Standard uncertainty, px, where points are a pixel apart: of its own, and per px of residual, of
 # the triangle's rise, and of what is higher beside the pixel. It grows with the spacing of points
 # to the power of GROWTH.
@@ -67,29 +68,28 @@ GROWTH = 0.66
 
 
 @kernel
-def _higher(disparity: Floats, reach: int) -> Floats:
-    """By how much the highest disparity up to ``reach`` px around is above each pixel's own, px
-    (κ of eq. 12 of docs/explanation/surface.md); NaN where a pixel has none."""
+def _higher(disparity: Floats, reach: int, wanted: Bools) -> Floats:
+    """By how much the highest disparity up to ``reach`` px around is above each ``wanted`` pixel's
+    own, px (κ of eq. 12 of docs/explanation/surface.md); NaN elsewhere."""
     rows, cols = disparity.shape
-    along, out = np.empty_like(disparity), np.empty_like(disparity)
+    out = np.full(disparity.shape, np.nan)
     for j in range(rows):
         for i in range(cols):
-            along[j, i] = -np.inf
-            for a in range(max(i - reach, 0), min(i + reach + 1, cols)):
-                if disparity[j, a] > along[j, i]:  # false for NaN
-                    along[j, i] = disparity[j, a]
-    for j in range(rows):
-        for i in range(cols):
+            if not wanted[j, i]:
+                continue
             high = -np.inf
             for b in range(max(j - reach, 0), min(j + reach + 1, rows)):
-                high = max(high, along[b, i])
+                for a in range(max(i - reach, 0), min(i + reach + 1, cols)):
+                    if disparity[b, a] > high:  # false for NaN
+                        high = disparity[b, a]
             out[j, i] = high - disparity[j, i]
     return out
 
 
 @kernel
-def _clearance(disparity: Floats, above: Floats, reach_rows: int) -> Floats:
-    """Distance px in the right image from each pixel to the nearest surface that is higher.
+def _clearance(disparity: Floats, above: Floats, reach_rows: int, wanted: Bools) -> Floats:
+    """Distance px in the right image from each ``wanted`` pixel to the nearest surface that is
+    higher; infinite elsewhere.
 
     ``disparity`` [h, w] of the pixels, ``above`` [h, w] of what may be higher, NaN for nothing. The
     next BESIDE_PX to the right in the left image count, in ``reach_rows`` rows above and below the
@@ -97,19 +97,16 @@ def _clearance(disparity: Floats, above: Floats, reach_rows: int) -> Floats:
     docs/explanation/surface.md).
     """
     rows, cols = disparity.shape
-    highest = np.full(above.shape, -np.inf)
-    for j in range(rows):
-        for b in range(max(j - reach_rows, 0), min(j + reach_rows + 1, rows)):
-            for i in range(cols):
-                if above[b, i] > highest[j, i]:  # false for NaN
-                    highest[j, i] = above[b, i]
     out = np.full(disparity.shape, np.inf)
     for j in range(rows):
         for i in range(cols):
-            for a in range(i + 1, min(i + BESIDE_PX + 1, cols)):
-                rise = highest[j, a] - disparity[j, i]
-                if rise > ABOVE_PX and a - i - rise < out[j, i]:
-                    out[j, i] = a - i - rise
+            if not wanted[j, i]:
+                continue
+            for b in range(max(j - reach_rows, 0), min(j + reach_rows + 1, rows)):
+                for a in range(i + 1, min(i + BESIDE_PX + 1, cols)):
+                    rise = above[b, a] - disparity[j, i]
+                    if rise > ABOVE_PX and a - i - rise < out[j, i]:  # false for NaN
+                        out[j, i] = a - i - rise
     return out
 
 
@@ -160,7 +157,7 @@ class NearestTops:
         """Where a gentle triangle is nearest, and nothing near it is much higher."""
         with np.errstate(invalid="ignore"):
             out = self.disparity > self.before - OCCLUSION_TOLERANCE_PX
-            return out & (_higher(self.highest, HIGHER_REACH) <= HIGHER_PX)
+            return out & (_higher(self.highest, HIGHER_REACH, out) <= HIGHER_PX)
 
     def values(self, chosen: Bools, projected: ProjectedSurface) -> PixelValues:
         """What the triangles of the ``chosen`` pixels have there; the variance is none of
@@ -174,7 +171,7 @@ class NearestTops:
     def variance(self, chosen: Bools, rough: RoughTops, scale: PixelScale) -> Floats:
         """Variance px² [h, w] of what the ``chosen`` pixels show, NaN elsewhere."""
         out = np.full(chosen.shape, np.nan)
-        higher = _higher(self.highest, 1)[chosen]
+        higher = _higher(self.highest, 1, chosen)[chosen]
         out[chosen] = _variance(rough, self.index[chosen], higher, scale)
         return out
 
@@ -190,7 +187,7 @@ def crowns(seen: SeenSurface, scale: PixelScale, edge_margin_px: float) -> Crown
         labelled = is_open & nearest.in_front()
         labelled &= ~(np.abs(disparity - seen.disparity) <= FACET_RESIDUAL_PX)
     spacing_rows = int(np.ceil(scale.spacing_px))
-    labelled &= _clearance(disparity, nearest.highest, spacing_rows) >= CLEARANCE_PX
+    labelled &= _clearance(disparity, nearest.highest, spacing_rows, labelled) >= CLEARANCE_PX
     labelled &= ~_hidden_in_right(seen.projected, labelled, disparity)
     values = nearest.values(labelled, seen.projected)
     variance = nearest.variance(labelled, seen.projected.surface.tops, scale)
@@ -220,10 +217,30 @@ def without_contours(
     reach = int(scale.spacing_px)
     if reach:
         beside |= box_max(hidden, reach)
-    uncertain = _clearance(labels.labels.disparity, crowns.tops, 1) < np.sqrt(2) * scale.spacing_px
-    status = labels.status.copy()
-    status[is_labelled(status) & beside & uncertain] = Status.EDGE_IN_PIXEL
-    return replace(labels, status=status)
+    beside &= is_labelled(labels.status)
+    clearance = _clearance(labels.labels.disparity, crowns.tops, 1, beside)
+    uncertain = beside & (clearance < np.sqrt(2) * scale.spacing_px)
+    return replace(labels, status=merged_status({Status.EDGE_IN_PIXEL: uncertain}, labels.status))
+
+
+@kernel
+def _near(
+    x: Floats, y: Floats, corner: Steps, first: tuple[int, int], squares: Bools, out: Bools
+) -> None:
+    """Which triangles' bounding boxes in the right image touch one of the ``squares``, of which
+    ``first`` is the (row, column) px of the first."""
+    rows, cols = squares.shape
+    for t in range(len(corner)):
+        a, b, c = corner[t]
+        top = (int(np.floor(min(y[a], y[b], y[c]))) - first[0]) >> NEAR_BITS
+        bottom = (int(np.floor(max(y[a], y[b], y[c]))) - first[0]) >> NEAR_BITS
+        if top >= rows or bottom < 0:
+            continue
+        left = (int(np.floor(min(x[a], x[b], x[c]))) - first[1]) >> NEAR_BITS
+        right = (int(np.floor(max(x[a], x[b], x[c]))) - first[1]) >> NEAR_BITS
+        for j in range(max(top, 0), min(bottom + 1, rows)):
+            for i in range(max(left, 0), min(right + 1, cols)):
+                out[t] |= squares[j, i]
 
 
 def _hidden_in_right(projected: ProjectedSurface, labelled: Bools, disparity: Floats) -> Bools:
@@ -234,7 +251,14 @@ def _hidden_in_right(projected: ProjectedSurface, labelled: Bools, disparity: Fl
     if row.size:
         surface = projected.surface
         pixels = right_pixels(row, col, disparity[row, col], projected.first)
-        corner = np.concatenate([surface.facet, surface.tops.corner])
+        # crowns are few: most facets are near none of them
+        column = np.floor(col + projected.first[1] - disparity[row, col]).astype(np.int64)
+        size = int(row.max()) >> NEAR_BITS, (pixels.width - 1) >> NEAR_BITS
+        squares = np.zeros((size[0] + 1, size[1] + 1), np.bool_)
+        squares[row >> NEAR_BITS, column - pixels.first[1] >> NEAR_BITS] = True
+        near = np.zeros(len(surface.facet), np.bool_)
+        _near(*projected.xy[2:], surface.facet, pixels.first, squares, near)
+        corner = np.concatenate([surface.facet[near], surface.tops.corner])
         hidden = projected.hidden_by_facets(corner, pixels)
         out[row, col] = hidden | projected.hidden_by_prisms(surface.strips, pixels)
     return out
@@ -260,16 +284,14 @@ def with_crowns(labels: WindowLabels, crowns: Crowns, window: PairWindow) -> Win
 
     Labels of other statuses stay as they are.
     """
-    row, col = np.nonzero(crowns.visible & (labels.status == Status.EDGE_IN_PIXEL))
-    inside, _ = window.usable(row, col, crowns.labels.disparity[row, col])
-    new = np.zeros(labels.status.shape, np.bool_)
-    new[row[inside], col[inside]] = True
+    new = crowns.visible & (labels.status == Status.EDGE_IN_PIXEL)
+    new, _ = window.usable(new, crowns.labels.disparity)
     around = window_sums(np.pad(new | is_labelled(labels.status), 1), 3)
     new &= around >= LABELS_AROUND
     of_crowns, others = crowns.labels, labels.labels
     return replace(
         labels,
-        status=np.where(new, np.uint8(Status.LABELLED_CROWN), labels.status),
+        status=merged_status({Status.LABELLED_CROWN: new}, labels.status),
         labels=Labels(
             np.where(new, of_crowns.disparity, others.disparity),
             np.where(new, of_crowns.slope, others.slope),

@@ -41,7 +41,7 @@ from ..surface.scale import BASE_OVER_HEIGHT, PART
 from ..surface.surface_store import Box, SurfaceStore
 from ..surface.vertices import Vertices
 from .crowns import HIGHER_PX, HIGHER_REACH, NearestTops
-from .pixel_scale import PixelScale
+from .view_geometry import PixelScale
 
 log = logging.getLogger("stereotruth")
 Floats = NDArray[np.float64]

@@ -1,7 +1,7 @@
 """The paper's own way from points to labels (section III-C).
 
 1. A point is dropped if the windows of both images around its places do not correlate
-   (:func:`.paper_correlation.correlate`), whatever the reason: hidden, changed, moved.
+   (:func:`correlate`), whatever the reason: hidden, changed, moved.
 2. A pixel's label is the disparity of one point: mean longitude and latitude of its points that
    are left, at the height of the highest.
 3. A pixel with fewer than ``min_points`` of them has no label.
@@ -12,70 +12,258 @@ pixels, by the root of their number.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.config.configuration import LabelSettings
+from ..core.kernels import inner, kernel
 from ..core.status import Status
-from ..lidar.lattice import PER_DEG
-from .pair_window import PairWindow, WindowLabels
-from .paper_correlation import correlate
-from .pixel_labels import Labels, condense, noise_variance
-from .pixel_points import PixelPoints
-from .view_geometry import ViewGeometry
+from ..lidar.lattice import PER_DEG, PER_M
+from .layers import layers, layers_of
+from .pair_window import (
+    MASKED,
+    USABLE,
+    Labels,
+    MaskedImage,
+    PairWindow,
+    Patch,
+    WindowLabels,
+    merged_status,
+    usable_at,
+)
+from .pixel_labels import BITS, PX, noise_variance
+from .scene_inputs import SceneInputs
+from .window_points import WindowGround
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+PART_PX = 256  # side of the parts of a block whose points are in memory at once
+# A variance below this share of the mean square is what rounding leaves of a constant window.
+CONSTANT = 1e-13
+DAY_BITS, CLASS_BITS = 16, 8
+
+
+class Points(NamedTuple):
+    """Points [n] of a window in both frames: number of their ``pixel`` (row-major); places in steps
+    of 1 / PX px, column and row in the left image and in the right one; lattice coordinates, ASPRS
+    class, and day since 1970-01-01."""
+
+    pixel: Ints
+    x: Ints
+    y: Ints
+    x_right: Ints
+    y_right: Ints
+    lon_q: Ints
+    lat_q: Ints
+    h_q: Ints
+    surface_class: Ints
+    day: Ints
+
+
+class Pixels(NamedTuple):
+    """What a window's points leave of its pixels, arrays [h, w]: number of those ``in_frames`` and
+    ``outside`` of these; whether a mask hides one (``masked``)."""
+
+    in_frames: Ints
+    outside: Ints
+    masked: Bools
+
+
+def points_of(ground: WindowGround, window: PairWindow) -> tuple[Points, Pixels]:
+    """The points of a window, those in both frames by their pixel."""
+    (rows, cols), (row, col) = window.shape, window.first
+    parts = [Points(*np.empty((10, 0), np.int64))]
+    outside, masked = np.zeros((2, rows * cols), np.int64)
+    for block in ground.blocks():
+        known = np.flatnonzero(np.isfinite(block.xy[2]))
+        x, y, x_right, y_right = np.rint(block.xy[:, known] * PX).astype(np.int64)
+        i, j = (x + PX // 2 >> BITS) - col, (y + PX // 2 >> BITS) - row
+        inside = (i >= 0) & (j >= 0) & (i < cols) & (j < rows)
+        y_right = y + np.clip(y_right - y, -PX // 2, PX // 2 - 1)
+        lattice = block.lon_q, block.lat_q, block.h_q, block.surface_class, block.day
+        taken = (q[known][inside].astype(np.int64) for q in lattice)
+        places = (q[inside] for q in (j * cols + i, x, y, x_right, y_right))
+        points = Points(*places, *taken)
+        here = usable_at(window.left, points.y >> BITS, points.x >> BITS)
+        there = usable_at(window.right, points.y_right >> BITS, points.x_right >> BITS)
+        framed = here & there == USABLE
+        outside += np.bincount(points.pixel[~framed], minlength=outside.size)
+        hidden = (here | there) & MASKED != 0
+        masked += np.bincount(points.pixel[hidden], minlength=masked.size)
+        parts.append(Points(*(values[framed] for values in points)))
+    points = Points(*(np.concatenate(values) for values in zip(*parts)))
+    in_frames = np.bincount(points.pixel, minlength=outside.size)
+    shape = window.shape
+    return points, Pixels(
+        in_frames.reshape(shape), outside.reshape(shape), masked.reshape(shape) > 0
+    )
+
+
+@inner
+def _sample(
+    image: Singles, row: int, col: int, size: int, fx: float, fy: float, out: Floats
+) -> None:
+    """A window of ``size`` x ``size`` bilinear samples, the first (fx, fy) px from a pixel."""
+    k = 0
+    for j in range(row, row + size):
+        for i in range(col, col + size):
+            above = (1.0 - fx) * image[j, i] + fx * image[j, i + 1]
+            below = (1.0 - fx) * image[j + 1, i] + fx * image[j + 1, i + 1]
+            out[k] = (1.0 - fy) * above + fy * below
+            k += 1
+
+
+@kernel
+def _correlate(left: Singles, right: Singles, places: Ints, size: int, out: Singles) -> None:
+    """Of points whose windows begin at the ``places`` [4, n] (steps) of both images."""
+    a, b = np.empty(size * size), np.empty(size * size)
+    mask = PX - 1
+    for k in range(out.size):
+        x, y, x_right, y_right = places[:, k]
+        _sample(left, y >> BITS, x >> BITS, size, (x & mask) / PX, (y & mask) / PX, a)
+        fx, fy = (x_right & mask) / PX, (y_right & mask) / PX
+        _sample(right, y_right >> BITS, x_right >> BITS, size, fx, fy, b)
+        mean_a, mean_b = a.mean(), b.mean()
+        aa = bb = ab = square_a = square_b = 0.0
+        for m in range(a.size):
+            u, v = a[m] - mean_a, b[m] - mean_b
+            aa += u * u
+            bb += v * v
+            ab += u * v
+            square_a += a[m] * a[m]
+            square_b += b[m] * b[m]
+        out[k] = 0.0
+        if aa > CONSTANT * square_a and bb > CONSTANT * square_b:
+            out[k] = min(max(ab / np.sqrt(aa * bb), -1.0), 1.0)
+
+
+def correlate(points: Points, left: Patch, right: Patch, window: int) -> Singles:
+    """Correlation coefficient [n] of the windows of both images around each point, in [-1, 1].
+
+    A window is centred on the point's sub-pixel place and sampled there by bilinear interpolation.
+    0 where either window is constant: no texture is no evidence that the place is the same. The
+    patches must be those by which the points are in both frames, read for this ``window`` (odd,
+    px).
+    """
+    out = np.empty(points.x.size, np.float32)
+    corners = ((patch.col + window // 2, patch.row + window // 2) for patch in (left, right))
+    first = np.concatenate([*map(np.array, corners)])[:, None] << BITS
+    places = np.stack([points.x, points.y, points.x_right, points.y_right]) - first
+    _correlate(left.pixels, right.pixels, places, window, out)
+    return out
+
+
+def paper_layers(
+    scene: SceneInputs, rows: slice, cols: slice
+) -> tuple[dict[str, NDArray], Ints] | None:
+    """The layers of a window and the numbers of its points, all, in both frames and used; None
+    without points."""
+    every = layers(scene.settings, scene.view, scene.has_masks)
+    shape = rows.stop - rows.start, cols.stop - cols.start
+    out = {name: np.full(shape, layer.fill, layer.dtype) for name, layer in every.items()}
+    counts, has_points = np.zeros(3, np.int64), False
+    for row in range(rows.start, rows.stop, PART_PX):
+        for col in range(cols.start, cols.stop, PART_PX):
+            part = (
+                slice(row, min(row + PART_PX, rows.stop)),
+                slice(col, min(col + PART_PX, cols.stop)),
+            )
+            made = _layers_of_part(scene, *part)
+            if made is None:
+                continue
+            has_points = True
+            counts += made[1]
+            where = tuple(
+                slice(edge.start - whole.start, edge.stop - whole.start)
+                for edge, whole in zip(part, (rows, cols))
+            )
+            for name, values in made[0].items():
+                out[name][where] = values
+    if isinstance(image := scene.pair.images[0], MaskedImage):
+        masked = image.mask[rows, cols] != 0
+        for name, layer in every.items():
+            out[name][masked] = Status.MASKED if name == "status" else layer.fill
+    return (out, counts) if has_points else None
+
+
+def _layers_of_part(
+    scene: SceneInputs, rows: slice, cols: slice
+) -> tuple[dict[str, NDArray], Ints] | None:
+    footprint = scene.windows.footprint(rows, cols)
+    if footprint is None:
+        return None
+    ground = scene.windows.ground(scene.windows.strips(rows, cols, footprint), None)
+    if ground is None:
+        return None
+    window = scene.points_window(rows, cols, footprint, scene.settings.window)
+    points, pixels = points_of(ground, window)
+    labels, correlation = paper_labels(scene, window, points, pixels)
+    labels, inner = labels.within(window.inner), window.inner
+    in_frames, outside = pixels.in_frames[inner].sum(), pixels.outside[inner].sum()
+    if in_frames + outside == 0:
+        return None
+    used = labels.point_count[np.isin(labels.status, (Status.LABELLED, Status.BELOW_MINIMUM_COUNT))]
+    no_change = np.zeros(labels.status.shape, np.uint8)
+    values = layers_of(labels, correlation[inner], no_change, scene.pair, rows, cols)
+    return values, np.array([in_frames + outside, in_frames, used.sum()])
 
 
 def paper_labels(
-    settings: LabelSettings,
-    model: ViewGeometry,
-    points: PixelPoints,
-    window: PairWindow,
-    px_per_m: float,
-    days: NDArray[np.uint16],
-) -> WindowLabels:
-    """Labels of a window from its points in both frames.
+    scene: SceneInputs, window: PairWindow, points: Points, pixels: Pixels
+) -> tuple[WindowLabels, Floats]:
+    """Labels of a window from its ``points`` in both frames, and the mean correlation [h, w] of the
+    points used."""
+    settings, shape = scene.settings, window.shape
+    correlation = correlate(points, window.left, window.right, settings.window)
+    use = np.flatnonzero(correlation >= settings.correlation_threshold)
+    use = use[np.argsort(points.pixel[use], kind="stable")]
+    used = Points(*(values[use] for values in points))
+    pixel, first, n = np.unique(used.pixel, return_index=True, return_counts=True)
+    # whole numbers, so that the order of the points does not count
+    highest = (used.h_q << CLASS_BITS | used.surface_class) << DAY_BITS | used.day
+    top = np.maximum.reduceat(highest, first) if n.size else highest
+    height = (top >> CLASS_BITS + DAY_BITS) / PER_M
+    disparity = used.x - used.x_right
+    relative = disparity - np.repeat(disparity[first], n)
+    whole = np.rint(correlation[use].astype(np.float64) * PX).astype(np.int64)
+    sums = [
+        np.add.reduceat(values, first) if n.size else values
+        for values in (used.lon_q, used.lat_q, relative, relative**2, whole)
+    ]
+    lon, lat = (total / n / PER_DEG for total in sums[:2])
+    xy = scene.pair.model.ground_to_epipolar(lon, lat, height) if n.size else np.empty((4, 0))
 
-    ``window``: its patches are read for the settings' window. ``px_per_m``: disparity of a metre of
-    height. ``days``: of the points, by their numbers.
-    """
+    def grid(values: NDArray, nothing: float) -> NDArray:
+        out = np.full(shape, nothing, np.result_type(values, type(nothing)))
+        out.reshape(-1)[pixel] = values
+        return out
 
-    def at_highest(sums: Ints, highest: Floats) -> Floats:
-        """Positions [4, pixels] (px) of mean longitude and latitude at the greatest height."""
-        xy = np.full((4, highest.size), np.nan)
-        known = np.flatnonzero(sums[:, 0])
-        lon, lat = (sums[known, axis] / sums[known, 0] / PER_DEG for axis in (1, 2))
-        xy[:, known] = model.ground_to_epipolar(lon, lat, highest[known])
-        return xy
-
-    every = np.ones(points.points.size, dtype=np.bool_)
-    correlation = correlate(points, every, window.left, window.right, settings.window)
-    correlated = correlation >= settings.correlation_threshold
-    pixels = condense(points, correlated, at_highest, correlation)
-    labelled = pixels.count > 0
-    level = np.zeros((2, *labelled.shape))
-    noise = noise_variance(pixels, labelled, level, px_per_m)
-    labels = Labels(
-        disparity=np.where(labelled, pixels.disparity, np.nan),
-        slope=level,
-        variance=noise / np.maximum(pixels.count, 1),
+    count = grid(n, 0)
+    labelled = count > 0
+    squares = grid((sums[3] - sums[2] ** 2 / n) / PX**2, 0.0)
+    noise = noise_variance(count, squares, labelled, scene.rays.px_per_m)
+    framed = pixels.in_frames > 0
+    status = merged_status(
+        {
+            Status.MASKED: pixels.masked & ~framed,
+            Status.OUT_OF_FRAME: (pixels.outside > 0) & ~framed,
+            Status.BELOW_MINIMUM_COUNT: labelled & (count < settings.min_points),
+            Status.LABELLED: labelled,
+            Status.LOW_CORRELATION: framed,
+        }
     )
-    status = np.full(points.shape, Status.NO_POINTS, dtype=np.uint8)
-    status[points.outside.reshape(points.shape) > 0] = Status.OUT_OF_FRAME
-    status[points.masked.reshape(points.shape)] = Status.MASKED
-    status[points.count > 0] = Status.LOW_CORRELATION
-    status[labelled] = Status.LABELLED
-    status[labelled & (pixels.count < settings.min_points)] = Status.BELOW_MINIMUM_COUNT
+    labels = Labels(
+        grid(xy[0] - xy[2], np.nan), np.zeros((2, *shape)), noise / np.maximum(count, 1)
+    )
     return WindowLabels(
         status=status,
         labels=labels,
-        height=pixels.highest,
-        surface_class=pixels.surface_class,
-        day=days[pixels.day],
-        point_count=pixels.count,
-        correlation=pixels.correlation,
-        change=np.zeros(status.shape, np.uint8),
-        beyond=np.zeros(status.shape, np.uint32),
-    )
+        height=grid(height, np.nan),
+        surface_class=grid(top >> DAY_BITS & (1 << CLASS_BITS) - 1, 0).astype(np.uint8),
+        day=grid(top & (1 << DAY_BITS) - 1, 0).astype(np.uint16),
+        point_count=count,
+    ), grid(sums[4] / n / PX, np.nan)

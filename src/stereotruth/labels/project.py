@@ -4,19 +4,21 @@ Every point is projected into both rectified images, and a pixel of the left epi
 label d = x_left - x_right (px) of what it shows, by one of two recipes (``project.recipe``): see
 :mod:`.recipe` and :mod:`.paper_recipe`. A point belongs to the pixel (floor(x_left + 0.5),
 floor(y_left + 0.5)). The right image's labels are those of the mirrored pair, see
-:mod:`.right_view`.
+:mod:`.view_geometry`.
 
-The grid is worked on in blocks of one shard, each independent of the others; a block is cut into
-windows of a bounded number of points. The result has the same bytes for any number of workers, size
-of windows, and order of blocks, stores and points.
+The grid is worked on in blocks of one shard: what the LiDAR decides of each, then what the images
+tell of it by the labels of this block and those beside it. The result has the same bytes for any
+number of workers and order of blocks, stores and points.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -27,28 +29,29 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.job import block_progress
 from ..core.products.grids import Strip, blocks, require_complete
+from ..core.products.making import refuse_replaced
 from ..core.products.provenance import checksums, describe, digest
-from ..core.products.resumable_grids import BlockStore, resumable_grid
+from ..core.products.resumable_grids import Block, BlockStore, Ledger, resumable_grid
 from ..core.status import Status, carries_label, is_labelled
 from ..epipolar.model import EpipolarModel
 from ..lidar.lattice import apart, refuse_apart
 from .change_evidence import Evidence
-from .image_patches import MaskedImage
-from .layers import layers
-from .lidar_read import lidar_read
-from .recipe import label_window
-from .scene_inputs import SceneInputs
+from .layers import LidarLabels, layers
+from .pair_window import MaskedImage
+from .recipe import image_layers, label_window, lidar_labels
+from .scene_inputs import SceneInputs, lidar_read
 
 log = logging.getLogger("stereotruth")
 
 
 CHUNK = 256
 SHARD = 1024
-MAX_POINTS = 6_000_000  # expected in a window; some 60 bytes each at the peak
+MAKES_LAYERS = "block"  # begins the names of such tasks
 
 
 LEAST_LABELLED = 0.4  # of the pixels with points: below, a warning says what to check
-# Of a block, see :func:`.recipe.label_window`.
+# Of a block: points in the grid, in both frames, used; and of the recipe surface pixels of which
+# the images were asked, and of these the ones beyond what was learned by each figure.
 COUNTED = "in_grid", "in_frame", "used", "asked", *Evidence._fields
 # Share of the pixels that are asked which lies beyond what was learned by a figure of the evidence:
 # no simulated city and no real scene of those that trees are fitted to has more than 11 %.
@@ -75,53 +78,135 @@ def _log_density(inputs: SceneInputs) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Makes the blocks (rows, cols) of a view's grid; plain values, for other processes."""
+    """Makes the blocks (rows, cols) of a view's grid; plain values, for other processes.
+
+    First what the LiDAR decides of a block, which is kept in a file in ``folder`` (recipe surface);
+    then the layers, by that of the block and of those around it, which go to ``out``. ``content``:
+    digest of all that labels follow from but points and their surface. ``rows``: those of the grid
+    that this job makes layers of; of blocks beside these it needs little.
+    """
 
     scene: SceneInputs
-    max_points: int
+    out: BlockStore
+    content: str
+    folder: Path
+    rows: slice
 
-    def key(self, content: str, rows: slice, cols: slice) -> str:
-        """Digest of all that the labels of a block follow from: ``content`` and its points."""
-        here = self.scene.pair.cols(cols)
-        points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(rows, here))
-        surface = [block.sha256 for block in self.scene.surface_blocks(rows, here)]
-        return digest({"content": content, "points": points, "surface": surface})
+    def around(self, block: Block) -> list[Block]:
+        """The blocks whose labels have a say in a block, with itself."""
+        side, shape = self.out.shard, self.scene.pair.model.shape
+        reach = -(-self.scene.image_margin // side)
+        starts = (
+            range(max(edge.start - reach * side, 0), min(edge.start + reach * side + 1, size), side)
+            for edge, size in zip(block, shape)
+        )
+        return [
+            tuple(slice(first, min(first + side, size)) for first, size in zip(corner, shape))
+            for corner in product(*starts)
+        ]
 
-    def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:
+    def parts_around(self, block: Block) -> dict[str, Block]:
+        """The same by name, as far as the rows of this job need them."""
+        margin = self.scene.image_margin
+        low, high = self.rows.start - margin, self.rows.stop + margin
+        parts = {}
+        for rows, cols in self.around(block):
+            kept = slice(max(rows.start, low), min(rows.stop, high))
+            if kept.start < kept.stop:
+                parts["-".join(str(e.start // self.out.shard) for e in (kept, cols))] = kept, cols
+        return parts
+
+    def key(self, block: Block, margin: int = 0) -> str:
+        """Digest of all that the LiDAR decides of a block and ``margin`` px around it by:
+        ``content``, points and surface."""
+        block = block[0], self.scene.pair.cols(block[1])
+        window = tuple(slice(edge.start - margin, edge.stop + margin) for edge in block)
+        points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(*window))
+        surface = [part.sha256 for part in self.scene.surface_blocks(*window)]
+        return digest({"content": self.content, "points": points, "surface": surface})
+
+    def make_lidar(self, name: str, block: Block) -> None:
+        """Keep what the LiDAR decides of a block and the numbers of its points, if it is not there.
+
+        No file, if the block has no points.
+        """
+        ledger, file, key = Ledger(self.folder), self._file(name), self.key(block)
+        if ledger.find(name, key, {"labels": file}) is not None:
+            return
+        by_lidar = lidar_labels(self.scene, block[0], self.scene.pair.cols(block[1]))
+        counts = [0, 0]
+        if by_lidar is not None:
+            by_lidar[0].write(file)
+            counts = by_lidar[1].tolist()
+        refuse_replaced(self.out.inputs)
+        ledger.put(name, key, {"labels": file}, counts)
+
+    def make(self, key: str, block: Block, _after: Sequence[None] = ()) -> None:
         """Label one block and write it, with its pixels by status and what is COUNTED.
 
         Nothing, if it is there: a Dask worker that is lost takes with it that it had written it.
         """
-        if out.has((rows, cols), key):
+        if self.out.has(block, key):
             return
-        here = self.scene.pair.cols(cols)
-        shape = rows.stop - rows.start, cols.stop - cols.start
-        fill = layers(self.scene.settings, self.scene.view, self.scene.has_masks)
-        arrays: dict[str, NDArray] = {}
-        counted = np.zeros(len(COUNTED), dtype=np.int64)
-        for r, c in self.scene.windows.parts(rows, here, self.max_points):
-            labelled = label_window(self.scene, r, c)
-            if labelled is None:
-                continue
-            values, counts = labelled
-            part = (
-                slice(r.start - rows.start, r.stop - rows.start),
-                slice(c.start - here.start, c.stop - here.start),
-            )
-            for name, layer in values.items():
-                if name not in arrays:
-                    arrays[name] = np.full(shape, fill[name].fill, dtype=layer.dtype)
-                arrays[name][part] = layer
-            counted += counts
+        rows, here = block[0], self.scene.pair.cols(block[1])
+        made = (
+            self._layers(block) if self.scene.on_surface else label_window(self.scene, rows, here)
+        )
+        arrays, counts = made or ({}, np.zeros(0, np.int64))
         image = self.scene.pair.images[0]
-        if isinstance(image, MaskedImage) and (masked := image.mask[rows, here] != 0).any():
-            arrays.setdefault("status", np.full(shape, fill["status"].fill, np.uint8))
-            for name, array in arrays.items():
-                array[masked] = Status.MASKED if name == "status" else fill[name].fill
+        if made is None and isinstance(image, MaskedImage):
+            masked = image.mask[rows, here] != 0
+            arrays = {"status": masked * np.uint8(Status.MASKED)} if masked.any() else {}
         arrays = self.scene.pair.arrays(arrays)
-        status = arrays.get("status", np.zeros(shape, dtype=np.uint8))
+        shape = rows.stop - rows.start, here.stop - here.start
+        status = arrays.get("status", np.zeros(shape, np.uint8))
         pixels = np.bincount(status.reshape(-1), minlength=len(Status))
-        out.write((rows, cols), key, arrays, [*pixels.tolist(), *counted.tolist()])
+        counted = np.zeros(len(COUNTED), np.int64)
+        counted[: counts.size] = counts
+        self.out.write(block, key, arrays, [*pixels.tolist(), *counted.tolist()])
+
+    def _layers(self, block: Block) -> tuple[Mapping[str, NDArray], NDArray[np.int64]] | None:
+        """Of a block, and what is COUNTED there; None without points."""
+        parts, cols_of = self.parts_around(block), self.scene.pair.cols
+        own = next(name for name, part in parts.items() if part == block)
+        if not self._file(own).exists():
+            return None
+        files = [(self._file(name), (part[0], cols_of(part[1]))) for name, part in parts.items()]
+        margin, (rows, here) = self.scene.image_margin, (block[0], cols_of(block[1]))
+        window = (slice(edge.start - margin, edge.stop + margin) for edge in (rows, here))
+        layers, counts = image_layers(self.scene, rows, here, LidarLabels.read(files, *window))
+        return layers, np.concatenate([Ledger(self.folder).get(own).result, counts])
+
+    def _file(self, name: str) -> Path:
+        return self.folder / f"{name}.labels"
+
+    def forget(self, name: str, _after: Sequence[None]) -> None:
+        """Remove what is kept of a block, once all that it has a say in are made."""
+        self._file(name).unlink(missing_ok=True)
+
+    def tasks(self, missing: Sequence[tuple[str, Block]]) -> list[Any]:
+        """That make the ``missing`` blocks, each with its key."""
+
+        def delayed(call: Callable, kind: str, block: Block, *arguments: object) -> Any:
+            name = f"{kind}-{block[0].start:07d}-{block[1].start:07d}"
+            return dask.delayed(call, pure=False)(*arguments, dask_key_name=name)
+
+        lidar: dict[str, Any] = {}
+        tasks = []
+        readers: dict[str, list[Any]] = {}
+        for key, block in missing:
+            parts = self.parts_around(block) if self.scene.on_surface else {}
+            for name, part in parts.items():
+                if name not in lidar:
+                    lidar[name] = delayed(self.make_lidar, "lidar", part, name, part)
+            after = [lidar[name] for name in parts]
+            tasks.append(delayed(self.make, MAKES_LAYERS, block, key, block, after))
+            for name in parts:
+                readers.setdefault(name, []).append(tasks[-1])
+        for number, (name, after) in enumerate(readers.items()):
+            forget = dask.delayed(self.forget, pure=False)
+            tasks.append(forget(name, after, dask_key_name=f"forget-{number:07d}"))
+        return tasks
 
 
 def _identity(attrs: Mapping[str, Any]) -> str:
@@ -225,7 +310,6 @@ def project_scene(
     scene: str = "",
     workers: int = 1,
     scheduler: Any = dask.threaded.get,
-    max_points: int = MAX_POINTS,
     strip: Strip | None = None,
 ) -> dict[str, Any] | None:
     """Project the points of a scene and write its disparity grid; returns the summary.
@@ -256,7 +340,6 @@ def project_scene(
     attrs = _attributes(inputs, extent, scene, code)
     _log_density(inputs)
     content = _content(inputs, code)
-    job = _Blocks(inputs, max_points)
     shape = inputs.pair.model.shape
     grid = resumable_grid(
         out,
@@ -269,16 +352,16 @@ def project_scene(
     with grid as unfinished:
         every = blocks(shape, SHARD)
         part = every if strip is None else strip.of(every)
-        keys = [job.key(content, *block) for block in part]
-        tasks = [
-            dask.delayed(job.make, pure=False)(
-                unfinished, keys[number], *part[number], dask_key_name=f"block-{number:07d}"
-            )
-            for number in unfinished.missing(part, keys, workers)
-        ]
+        rows = slice(part[0][0].start, part[-1][0].stop) if part else slice(0, 0)
+        folder = unfinished.folder / "lidar" / str(strip or "all")
+        job = _Blocks(inputs, unfinished, content, folder, rows)
+        margin = inputs.image_margin if inputs.on_surface else 0
+        keys = [job.key(block, margin) for block in part]
+        missing = [(keys[k], part[k]) for k in unfinished.missing(part, keys, workers)]
+        tasks = job.tasks(missing)
         if tasks and inputs.on_surface:
             _ = inputs.noise  # once, and not by each of the threads
-        with block_progress(len(tasks), "disparity"):
+        with block_progress(len(missing), "disparity", MAKES_LAYERS):
             dask.compute(*tasks, scheduler=scheduler, num_workers=workers)
         if strip is not None:
             return None
@@ -286,6 +369,7 @@ def project_scene(
         if summary["points"]["in_frame"] == 0:
             extent.refuse()
         unfinished.write_atomically(out, every, attrs | {"summary": summary})
+        shutil.rmtree(unfinished.folder / "lidar", ignore_errors=True)
     _log_summary(inputs.settings.recipe, summary)
     return summary
 

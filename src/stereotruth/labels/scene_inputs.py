@@ -1,8 +1,10 @@
-"""What the labels of a scene are made of."""
+"""What the labels of a scene are made of; how much of its LiDAR was read, and where what both
+images show has none."""
 
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -16,17 +18,20 @@ from numpy.typing import NDArray
 from ..align.alignment import Alignment
 from ..align.label_uncertainty import LabelUncertainty, with_strips
 from ..core.config.configuration import LabelSettings
+from ..core.numerics.geometry import corners_of_hull
 from ..core.products.grids import require_complete
 from ..core.products.provenance import digest
 from ..core.status import Status, statuses_of
 from ..core.tables import acquisition_time
 from ..epipolar.model import EpipolarModel
-from ..lidar.lattice import LATTICE_DEG
+from ..lidar.lattice import CELL_DEG, LATTICE_DEG, cell_key
+from ..lidar.lattice import Footprint as LidarFootprint
 from ..lidar.point_statistics import points_per_m2
 from ..lidar.point_store import PointStore, open_stores
 from ..lidar.strips import StripOffsets
 from ..sensor.deliveries import Acquisition, by_sheet
 from ..sensor.image_noise import NoiseCurve, pair_noise
+from ..sensor.pair_geometry import frame, inside
 from ..sensor.rpc import RPC
 from ..sensor.site_pairs import PairLight, pair_light
 from ..surface.make_surface import make_surface
@@ -36,16 +41,11 @@ from .change_evidence import EVIDENCE_PX
 from .change_probability import MEANS_PX
 from .change_reasons import REASON_PX
 from .crowns import CROWN_REACH_PX
-from .ground_in_view import blocks_in_view
-from .image_patches import MaskedImage
-from .pixel_scale import PixelScale
-from .point_windows import PointWindows
-from .rays import Rays
-from .right_view import Pair, seen_from
+from .pair_window import MaskedImage, PairWindow, read_patch
+from .view_geometry import Pair, PixelScale, Rays, seen_from
+from .window_points import Footprint, PointWindows, blocks_in_view
 
 log = logging.getLogger("stereotruth")
-
-DAYS = 256  # of the points of a scene that have a number: 8 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,19 +169,20 @@ class SceneInputs:
         return self.settings.recipe == "surface"
 
     @property
-    def images_window(self) -> int:
-        """Side in px of the window that both images must hold around a label; 1: its pixel."""
-        return 1 if self.on_surface else self.settings.window
-
-    @property
     def margin(self) -> int:
         """Pixels around a window whose points have a say in it."""
         if not self.on_surface:
             return 1  # the points' noise is pooled over 3 x 3 pixels
         # what may hide a crown, farther off than the plane and the noise of a pixel's own points
-        # reach, and what the images tell of a pixel, and of those around
-        reach = CROWN_REACH_PX + MEANS_PX + max(EVIDENCE_PX, self.settings.window // 2 + 1)
-        return reach + REASON_PX  # of changes
+        # reach; and what is uncertain beside a contour
+        return max(CROWN_REACH_PX, int(np.ceil(self.scale.spacing_px)) + 1) + 2
+
+    @property
+    def image_margin(self) -> int:
+        """Pixels around a window whose labels have a say in what its images tell: of a pixel, of
+        those around it, and of changes."""
+        around = max(EVIDENCE_PX, self.settings.window // 2 + 1)
+        return MEANS_PX + around + REASON_PX
 
     @property
     def has_masks(self) -> bool:
@@ -208,22 +209,6 @@ class SceneInputs:
     def stores(self) -> tuple[PointStore, ...]:
         """The points."""
         return open_stores(self.point_stores)
-
-    @cached_property
-    def days(self) -> NDArray[np.uint16]:
-        """Days of the points since 1970-01-01, in their order behind a 0 for not known.
-
-        The first 255 of them: points of further days count as of none.
-        """
-        every = np.concatenate([[0], *(store.days for store in self.stores)])
-        return np.unique(every)[:DAYS].astype(np.uint16)
-
-    @cached_property
-    def day_numbers(self) -> NDArray[np.uint8]:
-        """Index of each day [65536] in :attr:`days`."""
-        numbers = np.zeros(1 << 16, np.uint8)
-        numbers[self.days] = np.arange(self.days.size)
-        return numbers
 
     @cached_property
     def scale(self) -> PixelScale:
@@ -259,6 +244,30 @@ class SceneInputs:
         shape = rows.stop - rows.start + 2 * margin, cols.stop - cols.start + 2 * margin
         return blocks_in_view(self.ground.blocks(footprint.around), self.pair.model, first, shape)
 
+    def points_window(
+        self, rows: slice, cols: slice, footprint: Footprint, around_px: int = 1
+    ) -> PairWindow:
+        """A window with its margin, and of the right image all that its points can be seen in; both
+        hold the square of ``around_px`` (odd) around a label."""
+        margin = self.margin
+        rows, cols = (slice(edge.start - margin, edge.stop + margin) for edge in (rows, cols))
+        x, y, height = (
+            grid.reshape(-1)
+            for grid in np.meshgrid(
+                np.linspace(cols.start - 1.0, cols.stop, 5),
+                np.linspace(rows.start - 1.0, rows.stop, 5),
+                [footprint.low, footprint.high],
+            )
+        )
+        model, (left, right) = self.pair.model, self.pair.images
+        x_right = model.ground_to_epipolar(*model.epipolar_to_ground(x, y, height), height)[2]
+        x_right = x_right[np.isfinite(x_right)]
+        more = 8  # px, for what is not linear in between
+        least, most = (x_right.min(), x_right.max()) if x_right.size else (0.0, 0.0)
+        there = slice(int(np.floor(least)) - more, int(np.ceil(most)) + more + 1)
+        patches = read_patch(left, rows, cols, around_px), read_patch(right, rows, there, around_px)
+        return PairWindow(rows, cols, margin, *patches)
+
 
 def _taken(
     attrs: Mapping[str, Any], cells: tuple[str, float | None, float | None], rpc: RPC
@@ -273,3 +282,113 @@ def _taken(
     by_row = None if azimuth is None or elevation is None else (azimuth, elevation)
     lon_lat = float(rpc.long_off), float(rpc.lat_off)
     return by_sheet(delivery, acquisition_time(acquired) if acquired else None, by_row, lon_lat)
+
+
+Bools = NDArray[np.bool_]
+
+EDGE = 33  # places along each side of a frame
+
+
+def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:
+    """Record of a scene's LiDAR: what was read of the files, and what is missing.
+
+    ``files`` (with points, all), ``nodes`` (read, all; of octrees), ``points`` and ``bytes`` (read,
+    all). ``holes_m2``: ground that both images show in whole cells without a point; ``hole`` (lon,
+    lat, degrees): the middle of the largest such place, or None. ``not_read_m2``: ground whose
+    points labels may follow from, and which the footprint left out. ``acquired``: first and last
+    day of the points, None unless all files tell them; ``doubts`` about the points; ``surfaces``:
+    what heights count from, by number of files; ``strips``: what they are off, None of one strip;
+    ``frame`` and epoch of the places, and those of the files. What is missing is logged, and files
+    of different surfaces.
+    """
+    attrs = [PointStore(path).attrs for path in inputs.point_stores]
+    nodes = [a["nodes"] for a in attrs if a["nodes"]]
+    points = [a["points"] for a in attrs]
+    holes_m2, hole = _holes(inputs, model)
+    if hole is not None:
+        log.warning(
+            "warning: %.3f km² of what both images show have no LiDAR point, most of it around "
+            "longitude %.5f, latitude %.5f",
+            holes_m2 / 1e6,
+            *hole,
+        )
+    return {
+        "files": [sum(p["kept"] > 0 for p in points), len(points)],
+        "nodes": np.sum(nodes, axis=0).tolist() if nodes else None,
+        "points": [sum(p[name] for p in points) for name in ("read", "header")],
+        "bytes": np.sum([a["bytes"] for a in attrs], axis=0).tolist(),
+        "holes_m2": holes_m2,
+        "hole": hole,
+        "not_read_m2": _not_read(inputs),
+        "acquired": _days([a["acquired"] for a in attrs]),
+        "doubts": sorted({text for a in attrs for text in a.get("doubts", ())}),
+        "surfaces": _surfaces([a["crs"]["heights"] for a in attrs]),
+        "strips": inputs.lidar_strips.report() if inputs.lidar_strips else None,
+        "frame": _frame([a["crs"].get("frame") for a in attrs]),
+    }
+
+
+def _frame(frames: Sequence[Mapping[str, Any] | None]) -> dict[str, Any] | None:
+    """Frame and epoch of the places, and the frames and epochs that files have them in."""
+    known = [frame for frame in frames if frame is not None]
+    if len(known) < len(frames) or not known:
+        return None
+    sources = {tuple((k, str(v)) for k, v in f["source"].items()): f["source"] for f in known}
+    return {**known[0], "source": [sources[key] for key in sorted(sources)]}
+
+
+def _days(acquired: Sequence[Mapping[str, str] | None]) -> list[str] | None:
+    days = [(one["start"], one["end"]) for one in acquired if one is not None]
+    if len(days) < len(acquired) or not days:
+        return None
+    return [min(first for first, _ in days), max(last for _, last in days)]
+
+
+def _surfaces(heights: Sequence[str]) -> dict[str, int]:
+    """What heights count from, without their units, which are metres by now."""
+    counts = Counter(text.rpartition(", in ")[0] for text in heights)
+    if len(counts) > 1:
+        log.warning(
+            "warning: heights of the LiDAR's files count from different surfaces (%s): check them, "
+            "or declare them by lidar_crs",
+            "; ".join(f"{count}: {text}" for text, count in counts.most_common()),
+        )
+    return dict(sorted(counts.items()))
+
+
+def _not_read(inputs: SceneInputs) -> float:
+    rows, cols = inputs.pair.model.shape
+    area = inputs.windows.beyond_stores(slice(0, rows), inputs.pair.cols(slice(0, cols)))
+    if area:
+        log.warning(
+            "warning: labels may follow from points on %.2f km² around the images that were not "
+            "read: the aligned images lie elsewhere than their RPCs say, or points lie far above "
+            "the ground. Set ingest.margin_m to more, or to null, to read them",
+            area / 1e6,
+        )
+    return round(area, 1)
+
+
+def _holes(inputs: SceneInputs, model: EpipolarModel) -> tuple[float, list[float] | None]:
+    """Ground (m²) of cells without a point whose middle both images show, and the largest place."""
+    ground = np.stack(model.left.localize(*frame(model.left_size, EDGE), model.reference_height))
+    ground = ground[:, np.isfinite(ground).all(axis=0)]
+    cells = LidarFootprint.around([ground[:, corners_of_hull(*ground)]], 0.0)
+    row, col = (at + first for at, first in zip(np.nonzero(cells.held), (cells.row, cells.col)))
+    lon, lat = (col + 0.5) * CELL_DEG, (row + 0.5) * CELL_DEG
+    missing = np.ones(row.size, np.bool_)
+    for sensor, size in ((model.left, model.left_size), (model.right, model.right_size)):
+        missing &= inside(np.stack(sensor.project(lon, lat, model.reference_height)), size)
+    for store in inputs.stores:
+        missing &= ~np.isin(cell_key(row, col), cell_key(store.cell_row, store.cell_col))
+    if not missing.any():
+        return 0.0, None
+    area = cells.cell_m2[row[missing] - cells.row].sum()
+    empty = np.zeros(cells.held.shape, np.uint8)
+    empty[row[missing] - cells.row, col[missing] - cells.col] = 1
+    import cv2  # few scenes have holes
+
+    _, _, sizes, middles = cv2.connectedComponentsWithStats(empty, connectivity=8)
+    x, y = middles[1 + int(np.argmax(sizes[1:, cv2.CC_STAT_AREA]))]
+    hole = (np.array([x + cells.col, y + cells.row]) + 0.5) * CELL_DEG
+    return round(float(area), 1), np.round(hole, 5).tolist()

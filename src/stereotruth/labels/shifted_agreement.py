@@ -20,9 +20,7 @@ from ..core.numerics.windows import box_max
 from ..epipolar.surface_windows import apart_from_steps, correlations, surface_mean, surface_means
 from ..epipolar.warping import values_in_row
 from ..epipolar.window_sums import BLOCK, Runs, wanted_runs
-from .image_patches import Detail
-from .pair_window import PairWindow
-from .pixel_labels import Labels
+from .pair_window import Detail, Labels, PairWindow
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -41,7 +39,7 @@ Z_LIMIT = 0.999
 SHIFTED_PX = 52  # by which these, and what their windows take in, reach beyond a pixel's match
 FAR = 2  # times as far off more of the surface is asked, which noise hides less
 AT_ONCE = 11  # shifts that are worked on together: which pixels count is the same for all
-TILE_PX = 256  # side of the parts of a window that are worked on as far as any of it is wanted
+TILE_PX = 512  # side of the parts of a window that are worked on as far as any of it is wanted
 
 
 @dataclass(frozen=True, eq=False)

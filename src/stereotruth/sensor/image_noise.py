@@ -157,22 +157,28 @@ def _parts(left: Grid, right: Grid, place: tuple[int, int], disparities: tuple[i
     there = right[rows, first:end].astype(np.float64)
     middle = _best_column(here, there)
     columns = range(max(middle - NEAR_PX, 0), min(middle + NEAR_PX, there.shape[1] - PLACE_PX) + 1)
-    rough, rough_there = _second_differences(here), _second_differences(there)
-    level, greatest = _of_parts(here), _of_parts(here, np.max)
-    own = level, greatest, _of_parts(rough)
+    level, greatest, square = _of_parts(here), _of_parts(here, np.max), _of_parts(here**2)
+    rough, all_there = _of_parts(_second_differences(here)), _of_parts(here > 0.0) == 1.0
+    # of the right image down the rows of a part; then each column is the first of some parts
+    down = [
+        of(values.reshape(PLACE_PX // PART_PX, PART_PX, -1), axis=1)
+        for values, of in (
+            (there, np.mean), (there, np.max), (there**2, np.mean),
+            (_second_differences(there), np.mean), (there > 0.0, np.all),
+        )
+    ]  # fmt: skip
     best = np.full((7, *level.shape), np.inf)
     for column in columns:
         at = slice(column, column + PLACE_PX)
-        match = there[:, at]
-        usable = _of_parts((here > 0.0) & (match > 0.0)) == 1.0
-        level_there = _of_parts(match)
-        gain = level / np.where(usable, level_there, 1.0)
-        wide = np.repeat(np.repeat(gain, PART_PX, axis=0), PART_PX, axis=1)
-        variance = np.where(usable, _of_parts((here - wide * match) ** 2), np.inf)
-        values = (
-            level, level_there, greatest, _of_parts(match, np.max),
-            own[2], _of_parts(rough_there[:, at]), variance,
-        )  # fmt: skip
+        level_there, greatest_there, square_there, rough_there, values_there = (
+            of(values[:, at].reshape(level.shape[0], -1, PART_PX), axis=2)
+            for values, of in zip(down, (np.mean, np.max, np.mean, np.mean, np.all))
+        )
+        gain = level / np.where(values_there, level_there, 1.0)
+        product = _of_parts(here * there[:, at])
+        variance = square - 2.0 * gain * product + gain**2 * square_there
+        variance = np.where(all_there & values_there, variance, np.inf)
+        values = level, level_there, greatest, greatest_there, rough, rough_there, variance
         best = np.where(variance < best[6], values, best)
     return best[:, np.isfinite(best[6]) & (best[4:] > 0.0).all(axis=0)].T
 

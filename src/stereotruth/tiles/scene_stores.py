@@ -87,7 +87,7 @@ class Fit(Protocol):
 
 
 class AlignmentNotes(Protocol):
-    """What an alignment says of labels, see :class:`stereotruth.align.aligned_pair.Alignment`."""
+    """What an alignment says of labels, see :class:`stereotruth.align.alignment.Alignment`."""
 
     fits: tuple[Fit, Fit]
     warnings: tuple[str, ...]

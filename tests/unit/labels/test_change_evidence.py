@@ -14,9 +14,7 @@ from stereotruth.labels.change_evidence import (
     LabelledWindow,
     change_evidence,
 )
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow
-from stereotruth.labels.pixel_labels import Labels
+from stereotruth.labels.pair_window import Labels, PairWindow, read_patch
 
 from ...synthetic.textured_fields import (
     ALL,
@@ -27,9 +25,7 @@ from ...synthetic.textured_fields import (
     ROWS,
     SHAPE,
     built,
-    ground,
     pair,
-    right_of,
     texture,
 )
 
@@ -57,19 +53,6 @@ def test_evidence_is_of_the_pixels_that_do_not_agree_fully() -> None:
     expected = 50.0 / np.sqrt(3.0) * np.sqrt(12.0)
     assert np.median(of_roof.contrast_left) == pytest.approx(expected, rel=0.1)
     assert np.median(of_roof.contrast_right) == pytest.approx(3.0 * expected, rel=0.1)
-
-
-def test_gain_is_what_brightness_differs_by_from_that_around() -> None:
-    left = ground(0)
-    right = right_of(left, np.full((160, 260), 4))
-    plain = evidence_of(pair(left, 2.0 * right))
-    assert not plain[0][INNER].any()
-    right[ROWS, slice(COLS.start - 4, COLS.stop - 4)][56:64, 71:79] *= 2.0 * ground(1)[:8, :8] / 500
-    doubtful, evidence = evidence_of(pair(left, right))
-    at = np.full(SHAPE, np.nan)
-    at[doubtful] = evidence.gain
-    share = 64 / 81  # of the means of 9 x 9 px, and of those up to 16 px off one in 81 every 4 px
-    assert at[59, 74] == pytest.approx(np.log(2.0) * (share - 4 / 81), abs=0.05)
 
 
 def test_evidence_is_the_same_in_any_window() -> None:
@@ -101,7 +84,7 @@ def test_evidence_is_the_same_in_any_window() -> None:
 
     inner = slice(EVIDENCE_PX, -EVIDENCE_PX)
     whole = within(slice(0, shape[0]), slice(0, shape[1]))
-    for first in range(1, 40, 3):
+    for first in range(1, 40, 9):
         part = slice(0, shape[0]), slice(first, shape[1])
         found = within(*part)[:, inner, inner]
         assert np.isfinite(found).any()

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from stereocities.truth import REASONS
-from stereotruth.core.status import Reason, Status
-from stereotruth.labels.change_reasons import REASON_PX, VEHICLE_M, is_common, with_reasons
-from stereotruth.labels.image_agreement import Comparison
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow, WindowLabels
-from stereotruth.labels.pixel_labels import Labels, OwnPoints
+from stereotruth.core.status import Reason
+from stereotruth.labels.change_evidence import LabelledWindow
+from stereotruth.labels.change_reasons import (
+    REASON_PX,
+    VEHICLE_M,
+    ChangedSurface,
+    is_common,
+    reasons_of,
+)
+from stereotruth.labels.pair_window import Labels, PairWindow, read_patch
 from stereotruth.labels.shifted_agreement import WIDE_SHIFTS_PX
 
 IMAGE = 200, 300
@@ -22,7 +25,6 @@ SHAPE = ROWS.stop - ROWS.start, COLS.stop - COLS.start
 LARGE, SMALL = np.s_[60:110, 60:120], np.s_[80:90, 90:106]  # of the window
 GROUND, TREE, BUILDING, WATER = 2, 5, 6, 9  # ASPRS
 DISPARITY, HEIGHT_M, PX_PER_M = 4, 50.0, 1.0
-COMPARISON = Comparison(9, (0.0, 0.0))
 
 
 def texture(seed: int) -> np.ndarray:
@@ -44,22 +46,40 @@ def images(patch: tuple[slice, slice], rise_px: int | None) -> PairWindow:
     return PairWindow(ROWS, COLS, 0, *patches)
 
 
-def lidar(
-    patch: tuple[slice, slice], surface_class: int, above_m: float
-) -> tuple[WindowLabels, OwnPoints]:
-    """Labels and points of a level ground on which the patch is of a class, so high above it, and
-    has changed."""
-    zeros, level = np.zeros(SHAPE), np.zeros((2, *SHAPE))
-    status, classes = np.full(SHAPE, Status.LABELLED, np.uint8), np.full(SHAPE, GROUND, np.uint8)
-    height, disparity = zeros + HEIGHT_M, zeros + DISPARITY
-    status[patch], classes[patch] = Status.CHANGED, surface_class
+@dataclass
+class Seen:
+    """What the LiDAR shows: whether pixels have changed, ``labels``, ``height`` (m) and class of
+    the surface, and of the points."""
+
+    changed: np.ndarray
+    disparity: np.ndarray
+    height: np.ndarray
+    classes: np.ndarray
+    highest: np.ndarray
+    highest_class: np.ndarray
+
+    def within(self, part: tuple[slice, slice]) -> Seen:
+        return Seen(*(values[part] for values in vars(self).values()))
+
+    def reasons(
+        self, window: PairWindow, *, rough: bool = False, diachronic: bool = False
+    ) -> np.ndarray:
+        is_rough, zeros = np.full(self.changed.shape, rough), np.zeros(self.changed.shape)
+        labels = Labels(self.disparity, np.zeros((2, *zeros.shape)), zeros)
+        compared = LabelledWindow(window, labels, zeros == 0, self.classes, (0.0, 0.0))
+        points = self.highest, self.highest_class
+        surface = ChangedSurface(self.changed, self.height, self.classes, is_rough, *points)
+        return reasons_of(surface, compared, PX_PER_M, diachronic)
+
+
+def lidar(patch: tuple[slice, slice], surface_class: int, above_m: float) -> Seen:
+    """A level ground on which the patch is of a class, so high above it, and has changed."""
+    changed, classes = np.zeros(SHAPE, np.bool_), np.full(SHAPE, GROUND, np.uint8)
+    height, disparity = np.full(SHAPE, HEIGHT_M), np.full(SHAPE, float(DISPARITY))
+    changed[patch], classes[patch] = True, surface_class
     height[patch] += above_m
     disparity[patch] += above_m * PX_PER_M
-    labels = Labels(disparity, level, zeros)
-    count = np.ones(SHAPE, np.int64)
-    nothing = np.zeros(SHAPE, np.uint8)
-    found = WindowLabels(status, labels, height, classes, zeros, count, zeros, nothing, nothing)
-    return found, OwnPoints(count, height, classes)
+    return Seen(changed, disparity, height, classes, height.copy(), classes.copy())
 
 
 def reasons(
@@ -67,20 +87,7 @@ def reasons(
 ) -> np.ndarray:
     """Of a patch that stands ``above_m`` over the ground in the LiDAR and ``now_m`` in both
     images, or is another surface in each (None)."""
-    labels, points = lidar(patch, surface_class, above_m)
-    return at(labels, points, images(patch, now_m), **options)
-
-
-def at(
-    labels: WindowLabels,
-    points: OwnPoints,
-    window: PairWindow,
-    *,
-    rough: bool = False,
-    comparison: Comparison = COMPARISON,
-) -> np.ndarray:
-    is_rough = np.full(labels.status.shape, rough)
-    return with_reasons(labels, is_rough, points, window, comparison, PX_PER_M).change
+    return lidar(patch, surface_class, above_m).reasons(images(patch, now_m), **options)
 
 
 @pytest.mark.parametrize(
@@ -109,8 +116,7 @@ def test_the_reason_follows_from_lidar_and_images(patch, surface_class, above_m,
     "now_m, reason", [(10, Reason.BUILT), (0, Reason.DEMOLISHED), (None, Reason.DEMOLISHED)]
 )
 def test_under_two_suns_a_building_that_agrees_nowhere_has_gone(now_m, reason) -> None:
-    comparison = COMPARISON._replace(diachronic=True)
-    change = reasons(LARGE, BUILDING, 6, now_m, comparison=comparison)
+    change = reasons(LARGE, BUILDING, 6, now_m, diachronic=True)
     assert (change[LARGE] == reason).mean() > 0.95
 
 
@@ -124,19 +130,18 @@ def test_a_chance_agreement_is_no_common_one() -> None:
 
 
 def test_a_tree_that_has_grown_has_one_of_the_lidar_in_it() -> None:
-    labels, points = lidar(SMALL, GROUND, 0)
-    points.surface_class[84:87, 97:101] = TREE
-    assert (at(labels, points, images(SMALL, None))[SMALL] == Reason.GROWN_OR_FELLED).all()
+    seen = lidar(SMALL, GROUND, 0)
+    seen.highest_class[84:87, 97:101] = TREE
+    assert (seen.reasons(images(SMALL, None))[SMALL] == Reason.GROWN_OR_FELLED).all()
 
 
 @pytest.mark.parametrize("beside_m, reason", [(-3.0, Reason.WATER), (-9.0, Reason.BUILT)])
 def test_a_flood_reaches_what_is_low_beside_water(beside_m: float, reason: Reason) -> None:
-    labels, points = lidar(LARGE, GROUND, 0)
-    points.surface_class[:, 45:130] = WATER
-    points.surface_class[LARGE] = GROUND
-    points.highest[points.surface_class == WATER] += beside_m
-    change = at(labels, points, images(LARGE, None))
-    assert (change[62:108, 62:70] == reason).all()
+    seen = lidar(LARGE, GROUND, 0)
+    seen.highest_class[:, 45:130] = WATER
+    seen.highest_class[LARGE] = GROUND
+    seen.highest[seen.highest_class == WATER] += beside_m
+    assert (seen.reasons(images(LARGE, None))[62:108, 62:70] == reason).all()
 
 
 @pytest.mark.parametrize(
@@ -155,29 +160,16 @@ def test_without_classes_roughness_and_height_decide(above_m, rough, reason) -> 
 
 @pytest.mark.parametrize(
     "surface_class, above_m, now_m, diachronic",
-    [(GROUND, 0, 6, False), (BUILDING, 6, 10, True), (BUILDING, 6, None, True)],
+    [(GROUND, 0, 6, False), (BUILDING, 6, None, True)],
 )
 def test_reasons_follow_from_what_is_near(surface_class, above_m, now_m, diachronic) -> None:
     """A window has the reasons of a larger one, but within REASON_PX and the reach of the
     comparison of its rim."""
-    comparison = COMPARISON._replace(diachronic=diachronic)
-    labels, points = lidar(LARGE, surface_class, above_m)
-    window = images(LARGE, now_m)
-    whole = at(labels, points, window, comparison=comparison)
+    seen, window = lidar(LARGE, surface_class, above_m), images(LARGE, now_m)
+    whole = seen.reasons(window, diachronic=diachronic)
     part, margin = np.s_[30:150, 40:180], REASON_PX + 10
-    cut = {name: getattr(points, name)[part] for name in OwnPoints.__dataclass_fields__}
-    small = replace(
-        window,
-        rows=slice(ROWS.start + 30, ROWS.start + 150),
-        cols=slice(COLS.start + 40, COLS.start + 180),
-    )
+    rows, cols = (slice(e.start + p.start, e.start + p.stop) for e, p in zip((ROWS, COLS), part))
     inner = np.s_[margin:-margin, margin:-margin]
-    change = at(labels.within(part), OwnPoints(**cut), small, comparison=comparison)[inner]
+    small = replace(window, rows=rows, cols=cols)
+    change = seen.within(part).reasons(small, diachronic=diachronic)[inner]
     assert change.any() and np.array_equal(change, whole[part][inner])
-
-
-def test_codes_are_those_of_the_simulator_but_for_texture() -> None:
-    """A change of texture alone is none of height; where nothing tells, the reason is unknown."""
-    names = [reason.name.lower() for reason in Reason]
-    assert names[:-1] == REASONS.split()[:-1]
-    assert (names[-1], REASONS.split()[-1]) == ("unknown", "texture")

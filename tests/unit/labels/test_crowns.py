@@ -84,13 +84,14 @@ def test_any_cut_gives_the_same_crowns(wood, view) -> None:
 
 
 def test_what_is_higher_and_what_turns_away() -> None:
-    flat = np.zeros((5, 40))
+    flat, every = np.zeros((5, 40)), np.ones((5, 40), np.bool_)
     flat[2, 20] = 3.0
-    assert _higher(flat, 1)[2, 19] == _higher(flat, 1)[3, 21] == 3.0
-    assert _higher(flat, 1)[2, 18] == 0.0 and _higher(flat, 3)[2, 18] == 3.0
-    assert np.isnan(_higher(np.full((3, 3), np.nan), 1)).all()
-    near = _clearance(np.zeros((5, 40)), flat, 0)
+    higher = _higher(flat, 1, every)
+    assert higher[2, 19] == higher[3, 21] == 3.0
+    assert higher[2, 18] == 0.0 and _higher(flat, 3, every)[2, 18] == 3.0
+    assert np.isnan(_higher(flat, 3, ~every)).all()
+    near = _clearance(np.zeros((5, 40)), flat, 0, every)
     assert np.isinf(near[0, 5]) and np.isinf(near[2, 21])
     assert near[2, 19] == 1.0 - 3.0  # covered by its neighbour,
     assert near[2, 17] == 0.0 and near[2, 16] == 1.0  # as the pixel is that lies 3 px beside it
-    assert np.isinf(near[1, 17]) and _clearance(np.zeros((5, 40)), flat, 1)[1, 17] == 0.0
+    assert np.isinf(near[1, 17]) and _clearance(np.zeros((5, 40)), flat, 1, every)[1, 17] == 0.0

@@ -102,13 +102,6 @@ def test_undecided_pixels_are_those_beside_steps(whole, truth):
         assert np.isnan(whole[name][~np.isin(whole["status"], (MEASURED, CROWN))]).all()
 
 
-def test_blocks_have_the_bytes_of_the_whole(whole, inputs):
-    rows, cols = slice(60, 110), slice(40, 120)
-    part = heights_of_block(inputs, rows, cols)
-    for name in LAYERS:
-        np.testing.assert_array_equal(part[name], whole[name][rows, cols])
-
-
 @pytest.fixture(scope="module")
 def wooded(tmp_path_factory):
     """Inputs of an image of a wooded city at 2 points/m², and what it shows."""

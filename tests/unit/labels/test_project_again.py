@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,9 +15,11 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.job import dask_scheduler
 from stereotruth.core.products.files import sealed
 from stereotruth.core.products.grids import Strip, seal
+from stereotruth.labels import project as module
+from stereotruth.labels import recipe
 from stereotruth.lidar.point_store import ATTRIBUTES
 
-from ...synthetic.box_scene import Scene, alignment_of, project_with, write_image, write_points
+from ...synthetic.box_scene import Scene, alignment_of, project_with, write_points
 from ...synthetic.stores import tree
 
 
@@ -80,15 +81,31 @@ def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path)
     assert project(scene, [scene.store], out) == touched  # and without the file again
 
 
-@pytest.mark.slow
-def test_other_images_settings_or_code_are_other_labels(scene, tmp_path):
-    out = tmp_path / "out.zarr"
-    everything = project(scene, [scene.store], out)
-    assert project(scene, [scene.store], out, min_points=3) == everything
-    left = zarr.open_group(scene.images[0], mode="r")["image"][:]
-    shutil.rmtree(scene.images[0])
-    name(write_image(scene.images[0], scene.model, np.maximum(left, 2) - 1), "another left image")
-    assert project(scene, [scene.store], out, min_points=3) == everything
+def test_a_killed_run_is_carried_on(scene, tmp_path, monkeypatch):
+    """What the LiDAR has decided is taken over; nothing of it is left in the end."""
+    whole, out = tmp_path / "whole.zarr", tmp_path / "out.zarr"
+    everything, made = project(scene, [scene.store], whole), []
+
+    def layers_of_some(*arguments):
+        made.append(arguments)
+        if len(made) > 4:
+            raise RuntimeError("killed")
+        return recipe.image_layers(*arguments)
+
+    def no_more(scene, rows, cols):
+        raise AssertionError(f"asked again: {rows}, {cols}")
+
+    with monkeypatch.context() as killed, pytest.raises(RuntimeError, match="killed"):
+        killed.setattr(module, "image_layers", layers_of_some)
+        project(scene, [scene.store], out, scheduler="sync")
+    work = tmp_path / ".out.zarr.work"
+    kept = {file.stem for file in (work / "lidar").rglob("*.labels")}
+    assert kept and not out.exists()
+    with monkeypatch.context() as complete:
+        if len(kept) == len(everything):
+            complete.setattr(module, "lidar_labels", no_more)
+        assert len(project(scene, [scene.store], out)) == len(everything) - 4
+    assert tree(out) == tree(whole) and not (work / "lidar").exists()
 
 
 @pytest.mark.slow

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from stereotruth.core.config.configuration import LabelSettings
-from stereotruth.core.status import Status, is_labelled, statuses_of
+from stereotruth.core.status import Status, is_labelled
 from stereotruth.labels.recipe import label_window
 from stereotruth.labels.scene_inputs import SceneInputs
 
-from ...synthetic.box_scene import ROOF, Scene, dilated, hidden_truth, seen
-from ...synthetic.cameras import HEIGHT, LAT, LON, METRES
+from ...synthetic.box_scene import ROOF, Scene, dilated, hidden_truth
+from ...synthetic.cameras import HEIGHT
 
 SPACING = 2.5  # m: one point in 13 px
 
@@ -78,17 +78,6 @@ def test_nothing_hidden_by_a_box_has_a_label(box) -> None:
     assert labelled[ground].mean() > 0.995
 
 
-def test_right_view_is_labelled_between_points_too(box) -> None:
-    east, north, height = seen(box.model, "right", box=True)
-    lon, lat = LON + east / METRES[0], LAT + north / METRES[1]
-    xy = box.model.ground_to_epipolar(lon, lat, height)
-    truth = (xy[0] - xy[2]).reshape(box.model.shape)
-    grid = box.project("of_right.zarr", view="right")
-    labelled = is_labelled(grid["status"].values)
-    assert labelled.sum() > 20_000
-    assert np.abs(grid["disparity"].values - truth)[labelled].max() < 1e-3
-
-
 @pytest.mark.parametrize(
     ("view", "recipe"), [("left", "surface"), ("right", "surface"), ("left", "paper")]
 )
@@ -116,10 +105,3 @@ def test_any_cut_and_any_order_give_the_same_bytes(box, view, recipe) -> None:
         where = np.s_[row.start - 60 : row.stop - 60, col.start - 70 : col.stop - 70]
         for name, values in found.items():
             assert values.tobytes() == np.ascontiguousarray(whole[name][where]).tobytes(), name
-
-
-@pytest.mark.parametrize("recipe", ["surface", "paper"])
-def test_labels_between_points_need_the_surface(recipe) -> None:
-    statuses = statuses_of(recipe, masked=False)
-    assert (Status.LABELLED_BETWEEN in statuses) == (recipe == "surface")
-    assert not {Status.LABELLED_BY_IMAGES, Status.MASKED} & set(statuses)

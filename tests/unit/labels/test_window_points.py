@@ -8,7 +8,7 @@ import pytest
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.labels import recipe as module
 from stereotruth.labels import scene_inputs
-from stereotruth.labels.ground_in_view import ground_in_view
+from stereotruth.labels.window_points import ground_in_view
 from stereotruth.surface.region import Region
 from stereotruth.surface.scale import PART
 from stereotruth.surface.vertices import Vertices
@@ -39,15 +39,6 @@ def in_view(height_at) -> np.ndarray:
     """Squares of 8 px that a window of 40 by 40 px in the middle may see."""
     found = vertices(height_at)
     return ground_in_view(found, 32.0 * PART, CELL, Leaning(), (80, 80), (40, 40)).squares
-
-
-def test_of_even_ground_it_is_the_window() -> None:
-    squares = in_view(lambda x, y: 0.0 * x)
-    assert squares.shape == (25, 25)
-    rows, cols = np.nonzero(squares)
-    assert (rows.min(), rows.max()) == (9, 15)  # 3 px more
-    assert cols.min() in range(7, 9) and cols.max() in range(16, 19)  # up to 19 px in the right
-    assert squares[9:16, 9:16].all()
 
 
 def test_a_tower_far_off_is_in_view() -> None:

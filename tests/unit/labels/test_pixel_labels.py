@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 from stereotruth.core.status import Status
-from stereotruth.labels.facet_labels import facet_labels
-from stereotruth.labels.image_patches import read_patch
-from stereotruth.labels.pair_window import PairWindow
-from stereotruth.labels.pixel_labels import Labels, OwnLabels, OwnPoints
-from stereotruth.labels.pixel_scale import PixelScale
+from stereotruth.labels.pair_window import (
+    PRECEDENCE,
+    Labels,
+    PairWindow,
+    merged_status,
+    read_patch,
+)
+from stereotruth.labels.pixel_labels import OwnLabels, OwnPoints, facet_labels
+from stereotruth.labels.view_geometry import PixelScale
 from stereotruth.surface.raster import VISIBLE, SeenSurface
 from stereotruth.surface.scale import SurfaceScale, ground_cell
 
@@ -38,10 +42,13 @@ def test_points_that_passed_are_an_edge_unless_they_show_through(see_through) ->
     passed = np.zeros(shape, np.bool_)
     passed[2, 3] = True
     own = OwnLabels(
+        points - level,
         Labels(points, np.zeros((2, *shape)), zeros),
+        np.isfinite(points) & ~seen.bulging,
         OwnPoints(zeros, points, nothing),
         passed,
-        np.zeros(shape, np.int32),
+        zeros,
+        0,
     )
     left = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(12, 20), 1)
     right = read_patch(np.full((20, 40), 500, np.uint16), slice(4, 12), slice(0, 20), 1)
@@ -58,3 +65,14 @@ def test_points_that_passed_are_an_edge_unless_they_show_through(see_through) ->
     assert labels.disparity[2, 2] == pytest.approx(10.2)
     assert status[2, 5] == Status.LABELLED and labels.disparity[2, 5] == 10.0  # no plane bulges
     assert np.isfinite(labels.disparity[2, 2:5]).tolist() == [True, see_through, False]
+
+
+def test_statuses_are_merged_in_one_order() -> None:
+    """Whatever the order of the masks; what a pixel had before counts as one of them."""
+    every = np.ones((1, 3), np.bool_)
+    labelled = {Status.LABELLED_BETWEEN: every, Status.LABELLED: np.array([[True, False, True]])}
+    edge = {Status.EDGE_IN_PIXEL: np.array([[False, False, True]])}
+    before = merged_status(labelled)
+    assert before.tolist() == [[Status.LABELLED, Status.LABELLED_BETWEEN, Status.LABELLED]]
+    assert np.array_equal(merged_status(edge, before), merged_status({**edge, **labelled}))
+    assert set(PRECEDENCE) <= set(Status) and PRECEDENCE[-1] == Status.NO_POINTS
