@@ -84,7 +84,7 @@ class _Blocks:
         """Digest of all that the labels of a block follow from: ``content`` and its points."""
         here = self.scene.pair.cols(cols)
         points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(rows, here))
-        surface = [block.sha256 for block in self.scene.surface_blocks(rows, here)]
+        surface = [block.checksum for block in self.scene.surface_blocks(rows, here)]
         return digest({"content": content, "points": points, "surface": surface})
 
     def make(self, out: BlockStore, key: str, rows: slice, cols: slice) -> None:

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import logging
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,8 @@ from ..lidar.overlap_check import refuse_apart
 from ..lidar.point_store import PointStore
 from .scale import PART, SurfaceScale
 from .shown_blocks import Box, Number, ShownBlocks, ShownGround
-from .surface import Core, GroundSurface, Parts, ground_surface
-from .surface_store import ATTRIBUTES, BLOCKS, CONTENTS, FORMAT, write_block
+from .surface import Core, Parts, ground_surface
+from .surface_store import ATTRIBUTES, BLOCKS, CONTENTS, FORMAT, GROUPS, GroupWriter, table_of
 from .vertices import VertexBuilder
 
 log = logging.getLogger("stereotruth")
@@ -67,12 +68,12 @@ def group_blocks(scale: SurfaceScale, side: int) -> int:
 
 
 @kernel
-def _parts_of(x: Ints, y: Ints, origin: Ints, numbers: Ints, boxes: Ints, side: int) -> Parts:
+def _parts_of(x: Ints, y: Ints, origin: Ints, numbers: Ints, boxes: Ints, bits: int) -> Parts:
     """In which of ``boxes`` [k, 2, 2] (first (x, y), that after the last) each of n vertices lies;
     -1 for none.
 
-    Box k lies in block ``numbers`` [k, 2] (row, col), a square of ``side`` on the lattice, where
-    vertices and boxes count from ``origin`` (x, y).
+    Box k lies in block ``numbers`` [k, 2] (row, col), a square of 1 << ``bits`` on the lattice,
+    where vertices and boxes count from ``origin`` (x, y).
     """
     first, last = np.empty(2, np.int64), np.empty(2, np.int64)
     for axis in range(2):
@@ -82,8 +83,8 @@ def _parts_of(x: Ints, y: Ints, origin: Ints, numbers: Ints, boxes: Ints, side: 
         box[numbers[k, 0] - first[0], numbers[k, 1] - first[1]] = k
     out = np.full(x.size, -1, np.int16)
     for n in range(x.size):
-        row = (origin[1] + y[n]) // side - first[0]
-        col = (origin[0] + x[n]) // side - first[1]
+        row = ((origin[1] + y[n]) >> bits) - first[0]
+        col = ((origin[0] + x[n]) >> bits) - first[1]
         if 0 <= row < box.shape[0] and 0 <= col < box.shape[1] and box[row, col] >= 0:
             low, high = boxes[box[row, col], 0], boxes[box[row, col], 1]
             if low[0] <= x[n] < high[0] and low[1] <= y[n] < high[1]:
@@ -102,9 +103,9 @@ class _Maker:
     folder: Path
     code: str
 
-    def file(self, number: Number) -> Path:
-        """Of a block."""
-        return self.folder / BLOCKS / f"{number[0]}_{number[1]}.npz"
+    def file(self, group: Group) -> Path:
+        """Of a group."""
+        return self.folder / GROUPS / f"{_name(group)}.bin"
 
     def parts(self, group: Group) -> dict[Number, Box]:
         """What images show of blocks: the first (col, row) of their cells and that after the last
@@ -137,14 +138,14 @@ class _Maker:
             }
         )
 
-    def surfaces(self, parts: Mapping[Number, Box]) -> Iterator[tuple[Number, GroundSurface]]:
-        """The triangles of each block that has any."""
+    def write(self, stream: BinaryIO, group: Group, parts: Mapping[Number, Box]) -> list[list]:
+        """The triangles of each block that has any, and its row of the store's table."""
         low, high = self.corners(parts.values())
         bounds = np.array([store.bounds[:4] for store in self.stores]) / LATTICE_DEG
         low = tuple(max(q, int(b) - 1) for q, b in zip(low, bounds[:, :2].min(axis=0)))
         high = tuple(min(q, int(b) + 1) for q, b in zip(high, bounds[:, 2:].max(axis=0)))
         if low[0] > high[0] or low[1] > high[1]:
-            return
+            return []
         builder = VertexBuilder(self.scale, low, high)
         some = False
         for points in self._points(low, high):
@@ -152,18 +153,20 @@ class _Maker:
             lattice = points.lon_q, points.lat_q, points.h_q
             builder.add(*lattice, points.classification, points.return_number, points.day)
         if not some:
-            return
+            return []
         first = np.array([q // size for q, size in zip(low, self.scale.cell)])
         boxes = (np.array(list(parts.values())) - first) * PART
         around = Core(tuple(boxes[:, 0].min(axis=0)), tuple(boxes[:, 1].max(axis=0)))
-        every = ground_surface(builder.built(), self.scale, around)
-        vertices, numbers = every.vertices, np.array(list(parts))
-        part = _parts_of(
-            vertices.x, vertices.y, first * PART, numbers, boxes, self.side * PART
-        )  # fmt: skip
+        vertices = builder.built()
+        every = ground_surface(vertices, self.scale, around)
+        numbers, bits = np.array(list(parts)), (self.side * PART).bit_length() - 1
+        part = _parts_of(vertices.x, vertices.y, first * PART, numbers, boxes, bits)
+        writer = GroupWriter(stream, group[0], every.vertices.x.size, vertices.x.size)
         for number, surface in zip(parts, every.split(part, len(parts))):
             if len(surface.facet) + len(surface.undecided) + len(surface.tops.corner):
-                yield number, surface
+                corner = [k * self.side * size for k, size in zip(number[::-1], self.scale.cell)]
+                writer.write(number, surface, (corner[0], corner[1]))
+        return writer.rows
 
     def _points(self, low: Number, high: Number) -> Iterable[Any]:
         """The points of a box, row of the stores' cells by row."""
@@ -176,20 +179,12 @@ class _Maker:
                 if len(points := store.query(west, edges[0], east, edges[1])):
                     yield points
 
-    def files(self, group: Group) -> dict[str, Path]:
-        """Of blocks, by name."""
-        return {self.file(number).stem: self.file(number) for number in group}
-
     def make(self, group: Group, parts: Mapping[Number, Box], key: str, done: Ledger) -> None:
-        """Blocks and their record."""
-        written = {}
-        for number, surface in self.surfaces(parts):
-            corner = [k * self.side * size for k, size in zip(number[::-1], self.scale.cell)]
-            with atomic_file(self.file(number)) as scratch:
-                facts = write_block(scratch, surface, (corner[0], corner[1]))
-            written[self.file(number).stem] = facts
+        """A group and its record."""
+        with atomic_file(self.file(group)) as scratch, scratch.open("wb") as stream:
+            rows = self.write(stream, group, parts)
         refuse_replaced(marks_of_inputs())
-        done.put(_name(group), key, self.files(group), written)
+        done.put(_name(group), key, {GROUPS: self.file(group)}, rows)
 
 
 def _around(boxes: Iterable[Box]) -> Box:
@@ -244,25 +239,19 @@ def make_surface(
     lock, done = FileLock(folder / "lock"), Ledger(folder / "done")
     try:
         lock.take(out)
-        (folder / BLOCKS).mkdir(exist_ok=True)
 
         def one(group: Group) -> None:
             parts = maker.parts(group)
             key = maker.key(parts)
-            if done.find(_name(group), key, maker.files(group)) is None:
+            if done.find(_name(group), key, {GROUPS: maker.file(group)}) is None:
                 maker.make(group, parts, key, done)
 
         with ThreadPoolExecutor(workers) as pool:
             for _ in progress(pool.map(one, groups), len(groups), "parts of the surface"):
                 pass
-        blocks = []
-        for group in groups:
-            piece = done.get(_name(group))
-            for number in group:
-                if (facts := piece.result.get(maker.file(number).stem)) is not None:
-                    sha256 = piece.sha256[maker.file(number).stem]
-                    blocks.append([*number, facts["box"], facts["heights"], sha256])
-        blocks.sort(key=lambda block: block[:2])
+        rows = {group: done.get(_name(group)).result for group in groups}
+        table = BytesIO()
+        np.save(table, table_of([row for of_group in rows.values() for row in of_group]))
         stores_made = {
             f"points/{s.path.name}": digest(dict(s.attrs.get("provenance", {}))) for s in stores
         }
@@ -275,19 +264,19 @@ def make_surface(
             "scale": asdict(scale),
             "side": side,
             "points_per_m2": round(density, 6),
-            "blocks": blocks,
+            "blocks_crc32": zlib.crc32(table.getvalue()),
             "provenance": describe({**stores_made, **(made_of or {})}, {"cell": list(cell)}, code),
         }
         with atomic_folder(out) as unfinished:
-            for row, col, *_ in blocks:
-                file = maker.file((row, col))
-                link(file, unfinished / BLOCKS / file.name)
+            for group in filter(rows.get, groups):
+                link(maker.file(group), unfinished / GROUPS / maker.file(group).name)
+            (unfinished / BLOCKS).write_bytes(table.getvalue())
             (unfinished / ATTRIBUTES).write_text(sealed(attrs), encoding="utf-8")
     finally:
         lock.close()
     log.info(
         "%d blocks of %d cells of %.2f m, about %.2g points per m²",
-        len(blocks), side, scale.cell_m, density,
+        sum(map(len, rows.values())), side, scale.cell_m, density,
     )  # fmt: skip
 
 

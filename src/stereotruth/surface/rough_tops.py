@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.kernels import inner, kernel
 from .delaunay import Triangles, triangulate
 from .scale import ROUGH_REACH, SurfaceScale, height_steps
-from .vertices import Vertices
+from .vertices import Vertices, height_ranges
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -158,10 +158,10 @@ class RoughTops:
     rise: Ints
     is_gentle: Bools
 
-    def taken(self, chosen: NDArray) -> RoughTops:
-        """The triangles of an index or a mask."""
+    def taken(self, chosen: NDArray[np.integer]) -> RoughTops:
+        """The triangles of an index."""
         values = self.corner, self.residual, self.rise, self.is_gentle
-        return RoughTops(*(one[chosen] for one in values))
+        return RoughTops(*(one.take(chosen, axis=0) for one in values))
 
 
 def rough_tops(vertices: Vertices, near_undecided: Bools, scale: SurfaceScale) -> RoughTops:
@@ -175,8 +175,8 @@ def rough_tops(vertices: Vertices, near_undecided: Bools, scale: SurfaceScale) -
     top = np.flatnonzero(~_passed(points, squares, radius, height_steps(scale.passed_m)))
     tops = points.taken(top)
     triangles = triangulate(tops.x, tops.y, scale.facet_radius)
-    rise = np.ptp(tops.h_q[triangles.corner], axis=1)
+    rise = np.diff(height_ranges(tops.h_q, triangles.corner))[:, 0]
     is_flat = rise <= height_steps(scale.steep_m)
     residual = _rms_residuals(tops, triangles, is_flat)
-    corner = number[top][triangles.corner]
+    corner = number[top].take(triangles.corner)
     return RoughTops(corner, residual, rise, is_flat & np.isfinite(residual))

@@ -24,13 +24,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.kernels import kernel
 from .breaklines import breaklines
 from .cut_triangles import cut_triangles, with_pieces
-from .delaunay import Triangles, triangulate
-from .facets import Facets, facets, height_variances
+from .delaunay import triangulate
+from .facets import facets, height_variances
 from .rough_tops import RoughTops, rough_tops
 from .scale import PART, SurfaceScale
-from .vertices import Vertices
+from .vertices import Vertices, height_ranges
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -90,29 +91,46 @@ class GroundSurface:
         ``part`` [n] of each vertex, -1 for none. Of a triangle that is cut, the part is that of the
         whole triangle.
         """
-        facets = _by_part(part[self.facet_origin], parts)
-        undecided = _by_part(part[self.undecided_origin], parts)
-        tops = _by_part(part[self.tops.corner[:, 0]], parts)
+        facets = _by_part(part, self.facet_origin, parts)
+        undecided = _by_part(part, self.undecided_origin, parts)
+        tops = _by_part(part, self.tops.corner[:, 0], parts)
         for facet, triangle, top in zip(facets, undecided, tops):
             yield replace(
                 self,
-                facet=self.facet[facet],
-                variance=self.variance[facet],
-                bulge=self.bulge[facet],
-                undecided=self.undecided[triangle],
-                height_range=self.height_range[triangle],
+                facet=self.facet.take(facet, axis=0),
+                variance=self.variance.take(facet),
+                bulge=self.bulge.take(facet),
+                undecided=self.undecided.take(triangle, axis=0),
+                height_range=self.height_range.take(triangle, axis=0),
                 whole=int(np.searchsorted(triangle, self.whole)),
                 tops=self.tops.taken(top),
-                facet_origin=self.facet_origin[facet],
-                undecided_origin=self.undecided_origin[triangle],
+                facet_origin=self.facet_origin.take(facet),
+                undecided_origin=self.undecided_origin.take(triangle),
             )
 
 
-def _by_part(part: Parts, parts: int) -> list[Ints]:
-    """Which triangles, of the ``part`` [m] of each, lie in each of so many; in their order."""
-    order = np.argsort(part, kind="stable")
-    ends = np.searchsorted(part[order], np.arange(parts + 1))
-    return [order[first:end] for first, end in pairwise(ends)]
+@kernel
+def _sorted_by_part(part: Parts, origin: Steps, parts: int) -> tuple[Steps, Ints]:
+    """Triangles by the ``part`` [n] of their first vertex ``origin`` [m], in their order, and where
+    those of each one begin."""
+    begin = np.zeros(parts + 1, np.int64)
+    for v in origin:
+        begin[part[v] + 1] += part[v] >= 0
+    for k in range(parts):
+        begin[k + 1] += begin[k]
+    order, filled = np.empty(begin[parts], np.int32), begin.copy()
+    for t in range(origin.size):
+        k = part[origin[t]]
+        if k >= 0:
+            order[filled[k]] = t
+            filled[k] += 1
+    return order, begin
+
+
+def _by_part(part: Parts, origin: Steps, parts: int) -> list[Steps]:
+    """Which triangles of first vertices ``origin`` [m] lie in each of so many ``parts``."""
+    order, begin = _sorted_by_part(part, origin, parts)
+    return [order[first:end] for first, end in pairwise(begin.tolist())]
 
 
 def ground_surface(
@@ -126,50 +144,59 @@ def ground_surface(
     planes = facets(vertices, triangles, scale)
     corner = triangles.corner
     wanted = np.ones(len(corner), np.bool_)
-    near_undecided = _near_undecided(vertices, triangles, planes)
+    near_undecided = _near_undecided(corner, planes.is_facet, vertices.x.size)
     if core is not None:
         own = core.holds(vertices)
-        wanted = own[corner[:, 0]]
+        wanted = own.take(corner[:, 0])
         near_undecided &= core.holds(vertices, scale.rough_halo_cells)
     tops = rough_tops(vertices, near_undecided, scale)
     if core is not None:
-        tops = tops.taken(own[tops.corner[:, 0]])
+        tops = tops.taken(np.flatnonzero(own.take(tops.corner[:, 0])))
 
     to_cut = np.flatnonzero(~planes.is_facet & wanted & (triangles.radius <= scale.facet_radius))
     lines = breaklines(
         vertices, triangles, planes.slopes, planes.is_facet, to_cut, scale, height_variances()
     )
     has_line = ~np.isnan(lines.line[:, 3])
-    to_cut, lines = to_cut[has_line], type(lines)(*(values[has_line] for values in lines))
-    pieces = cut_triangles(vertices, corner[to_cut], lines)
-    every, cut_facets, strips = with_pieces(vertices, corner[to_cut], lines, pieces, scale.cell)
+    found = np.flatnonzero(has_line)
+    to_cut, lines = to_cut[found], type(lines)(*(values.take(found, axis=0) for values in lines))
+    cut = corner.take(to_cut, axis=0)
+    pieces = cut_triangles(vertices, cut, lines)
+    every, cut_facets, strips = with_pieces(vertices, cut, lines, pieces, scale.cell)
 
-    is_facet = planes.is_facet & wanted
+    uncut = np.flatnonzero(planes.is_facet & wanted)
+    facet = corner.take(uncut, axis=0)
     is_whole = ~planes.is_facet & wanted
     is_whole[to_cut] = False
-    whole = corner[is_whole]
-    whole_range = np.stack([vertices.h_q[whole].min(axis=1), vertices.h_q[whole].max(axis=1)], 1)
-    first = corner[to_cut, 0]
+    whole = corner.take(np.flatnonzero(is_whole), axis=0)
+    first = cut[:, 0]
     cut_variance = lines.variance[pieces.facet_of, pieces.facet_side]
     return GroundSurface(
         vertices=every,
-        facet=np.concatenate([corner[is_facet], cut_facets]),
-        variance=np.concatenate([planes.variance[is_facet], cut_variance]),
-        bulge=np.concatenate([planes.bulge[is_facet], np.zeros(len(cut_facets))]),
+        facet=np.concatenate([facet, cut_facets]),
+        variance=np.concatenate([planes.variance.take(uncut), cut_variance]),
+        bulge=np.concatenate([planes.bulge.take(uncut), np.zeros(len(cut_facets))]),
         undecided=np.concatenate([whole, strips]),
-        height_range=np.concatenate([whole_range, np.rint(pieces.heights).astype(np.int64)]),
+        height_range=np.concatenate(
+            [height_ranges(vertices.h_q, whole), np.rint(pieces.heights).astype(np.int64)]
+        ),
         whole=len(whole),
         tops=tops,
-        facet_origin=np.concatenate([corner[is_facet, 0], first[pieces.facet_of]]),
+        facet_origin=np.concatenate([facet[:, 0], first[pieces.facet_of]]),
         undecided_origin=np.concatenate([whole[:, 0], first[pieces.strip_of]]),
     )
 
 
-def _near_undecided(vertices: Vertices, triangles: Triangles, planes: Facets) -> Bools:
+@kernel
+def _near_undecided(corner: Steps, is_facet: Bools, vertices: int) -> Bools:
     """Vertices [n] that share a triangle with one of an undecided triangle."""
-    near = np.zeros(vertices.x.size, np.bool_)
-    near[triangles.corner[~planes.is_facet].reshape(-1)] = True
-    touched = near[triangles.corner].any(axis=1)
-    near = np.zeros(vertices.x.size, np.bool_)
-    near[triangles.corner[touched].reshape(-1)] = True
-    return near
+    of_undecided, out = np.zeros(vertices, np.bool_), np.zeros(vertices, np.bool_)
+    for t in range(len(corner)):
+        if not is_facet[t]:
+            for i in range(3):
+                of_undecided[corner[t, i]] = True
+    for t in range(len(corner)):
+        a, b, c = corner[t]
+        if of_undecided[a] or of_undecided[b] or of_undecided[c]:
+            out[a] = out[b] = out[c] = True
+    return out

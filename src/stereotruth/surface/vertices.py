@@ -44,9 +44,27 @@ class Vertices(NamedTuple):
     count: Steps
     day: Days
 
-    def taken(self, chosen: NDArray) -> Vertices:
-        """The vertices of an index or a mask."""
-        return Vertices(*(values[chosen] for values in self))
+    @classmethod
+    def empty(cls, size: int) -> Vertices:
+        """Room for so many."""
+        places = (np.empty(size, np.int64) for _ in range(5))
+        return cls(
+            *places, np.empty(size, np.uint8), np.empty(size, np.int32), np.empty(size, np.uint16)
+        )
+
+    def taken(self, index: NDArray[np.integer]) -> Vertices:
+        """The vertices of an index."""
+        return Vertices(*(values.take(index) for values in self))
+
+
+@kernel
+def height_ranges(h: Ints, corner: Steps) -> Ints:
+    """Least and greatest height [n, 2] of the vertices of triangles [n, 3]."""
+    out = np.empty((len(corner), 2), np.int64)
+    for t in range(len(corner)):
+        a, b, c = h[corner[t, 0]], h[corner[t, 1]], h[corner[t, 2]]
+        out[t, 0], out[t, 1] = min(a, b, c), max(a, b, c)
+    return out
 
 
 class _Points(NamedTuple):
@@ -72,7 +90,7 @@ class _CellTops(NamedTuple):
 
 
 @inner
-def _whole(number: int, inverse: float) -> int:
+def whole_quotient(number: int, inverse: float) -> int:
     """``number`` // d, ``inverse`` = 1 / d; a division takes ten times as long.
 
     Exact from 0 to 2**50: there all roundings together are less than half a step.
@@ -100,7 +118,7 @@ def _raise_tops(points: _Points, tops: _CellTops, index: Steps, position: Steps)
         if returns[k] > 1:
             continue
         east, north = lon_q[k] - west, lat_q[k] - south
-        i, j = _whole(east, wide), _whole(north, tall)
+        i, j = whole_quotient(east, wide), whole_quotient(north, tall)
         index[n] = j * cols + i
         position[n, 0] = east - i * cell[0]
         position[n, 1] = north - j * cell[1]
@@ -164,8 +182,8 @@ def _means(
             if n > 1:
                 sums[k, 1], sums[k, 2] = sums[k, 1] // n, sums[k, 2] // n
                 h[k] = (n * np.int64(top[j, i]) - sums[k, 3]) // n
-            x[k] = (i << PART_BITS) + _whole(sums[k, 1] << PART_BITS, wide)
-            y[k] = (j << PART_BITS) + _whole(sums[k, 2] << PART_BITS, tall)
+            x[k] = (i << PART_BITS) + whole_quotient(sums[k, 1] << PART_BITS, wide)
+            y[k] = (j << PART_BITS) + whole_quotient(sums[k, 2] << PART_BITS, tall)
             classes[k] = top_class[j, i]
             row, col = (j + before[1]) // SQUARE_CELLS, (i + before[0]) // SQUARE_CELLS
             square[k] = row * grid.shape[1] + col
@@ -280,11 +298,6 @@ class VertexBuilder:
         points = np.zeros(even.is_even.size, np.int32)
         np.add.at(points, cells.square, sums[:, 0])
         size = n - int(even.is_even[cells.square].sum()) + int(even.is_even.sum())
-        out = Vertices(
-            *(np.empty(size, np.int64) for _ in range(5)),
-            np.empty(size, np.uint8),
-            np.empty(size, np.int32),
-            np.empty(size, np.uint16),
-        )
+        out = Vertices.empty(size)
         _thinned(number, sums, cells, self.tops, grid, even, points, out)
         return out
