@@ -25,6 +25,7 @@ from .feasible_lines import MOST_CORNERS, POLYGONS, RINGS, Band, Polygons, Sides
 from .scale import BREAKLINE_REACH, PART, SurfaceScale, height_steps
 from .step_points import (
     MOST_STEP_POINTS,
+    Around,
     Centroid,
     Nearby,
     StepPoints,
@@ -288,6 +289,11 @@ def _fill_breaklines(
     sides = Sides(
         np.empty(MOST_STEP_POINTS), np.empty(MOST_STEP_POINTS), np.empty(MOST_STEP_POINTS, np.bool_)
     )
+    most = 2 * MOST_STEP_POINTS
+    around = Around(
+        np.empty(most), np.empty(most), np.empty(most, np.int32), np.empty(most, np.bool_),
+        np.empty(most), np.empty(most), np.empty(most, np.bool_), np.empty(most, np.bool_),
+    )  # fmt: skip
     polygons = Polygons(
         np.empty((POLYGONS + 1, 2, MOST_CORNERS)),
         np.empty(POLYGONS + 1, np.int32),
@@ -295,6 +301,7 @@ def _fill_breaklines(
         np.empty(2),
         np.empty(MOST_CORNERS),
         np.empty(MOST_STEP_POINTS, np.int32),
+        np.empty(MOST_STEP_POINTS),
         np.empty(RINGS + 1, np.int32),
     )
     planes, sums = np.empty((2, 3)), np.empty((2, 5))
@@ -322,8 +329,8 @@ def _fill_breaklines(
         normal = nx / length, ny / length
         extent = 4.0 * radius[t]
         m, least_h, most_h = points_of_sides(
-            points, centre, planes, normal, reach, extent + width, spacing, residual, sides
-        )
+            points, centre, planes, normal, reach, extent + width, spacing, residual, around, sides
+        )  # fmt: skip
         s = feasible_lines(sides, m, extent, band, polygons)
         line = _mean_line(planed, corner[t], centre, normal, polygons, s)
         if line[3] > WIDEST_STRIP * spacing:

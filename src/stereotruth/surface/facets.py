@@ -90,7 +90,7 @@ def _vertex_slopes(
     """Slopes [n, 2] of the gentlest ``chosen`` triangle at each vertex (eq. 1 of
     docs/explanation/surface.md), slivers apart; NaN where none is."""
     x, y, h, corner = vertices.x, vertices.y, vertices.h_q, triangles.corner
-    out = np.full((x.size, 2), np.nan)
+    out, least = np.full((x.size, 2), np.nan), np.full(x.size, np.inf)
     for t in range(len(corner)):
         if not chosen[t]:
             continue
@@ -103,12 +103,13 @@ def _vertex_slopes(
             continue
         steep = gx * gx + gy * gy
         for v in (a, b, c):
-            old = out[v, 0] ** 2 + out[v, 1] ** 2
-            if not steep > old:  # also for NaN
-                # Equally steep ones: by their slopes, so that the order does not count.
-                if steep == old and (gx, gy) > (out[v, 0], out[v, 1]):
-                    continue
-                out[v, 0], out[v, 1] = gx, gy
+            # Equally steep ones: by their slopes, so that the order does not count.
+            if steep == least[v] and (gx, gy) > (out[v, 0], out[v, 1]):
+                continue
+            gentler = steep <= least[v]  # the processor could not predict a branch
+            out[v, 0] = gx if gentler else out[v, 0]
+            out[v, 1] = gy if gentler else out[v, 1]
+            least[v] = steep if gentler else least[v]
     return out
 
 
@@ -135,21 +136,22 @@ def _on_vertex_planes(
 
 
 @kernel
-def _incident(corner: Steps, vertices: int) -> tuple[Steps, Steps]:
-    """Triangles at each vertex: ``list[start[v] : start[v + 1]]``."""
+def _incident(corner: Steps, chosen: Bools, vertices: int) -> tuple[Steps, Steps]:
+    """The ``chosen`` triangles at each vertex: ``list[start[v] : start[v + 1]]``."""
     start = np.zeros(vertices + 1, np.int32)
     for t in range(len(corner)):
         for i in range(3):
-            start[corner[t, i] + 1] += 1
+            start[corner[t, i] + 1] += chosen[t]
     for v in range(vertices):
         start[v + 1] += start[v]
     filled = start[:-1].copy()
-    out = np.empty(3 * len(corner), np.int32)
+    out = np.empty(start[vertices], np.int32)
     for t in range(len(corner)):
-        for i in range(3):
-            v = corner[t, i]
-            out[filled[v]] = t
-            filled[v] += 1
+        if chosen[t]:
+            for i in range(3):
+                v = corner[t, i]
+                out[filled[v]] = t
+                filled[v] += 1
     return start, out
 
 
@@ -160,7 +162,7 @@ def _with_creases(
     """The triangles ``on_planes`` of their vertices, and the ``small`` ones on the plane of such a
     triangle that shares a vertex with them (eq. 2 of docs/explanation/surface.md)."""
     x, y, h = vertices.x, vertices.y, vertices.h_q
-    start, around = _incident(corner, x.size)
+    start, around = _incident(corner, on_planes, x.size)
     out = on_planes.copy()
     for t in range(len(corner)):
         if on_planes[t] or not small[t]:
@@ -169,8 +171,6 @@ def _with_creases(
             v = corner[t, i]
             for k in range(start[v], start[v + 1]):
                 f = around[k]
-                if not on_planes[f]:
-                    continue
                 gx, gy, _ = _slopes(x, y, h, corner[f, 0], corner[f, 1], corner[f, 2])
                 b, c = corner[t, (i + 1) % 3], corner[t, (i + 2) % 3]
                 if (

@@ -49,8 +49,8 @@ class Polygons(NamedTuple):
 
     ``corner`` [POLYGONS + 1, 2, MOST_CORNERS]: (a, b); ``size`` [POLYGONS + 1]: number of corners;
     ``last`` [POLYGONS + 1]: |v| of the last point that clipped it; ``limit`` [2]: how far along
-    either way the lines hold. ``value`` [MOST_CORNERS], ``order`` [points], ``ring`` [RINGS + 1]:
-    room to work in.
+    either way the lines hold. ``value`` [MOST_CORNERS], ``order``, ``far`` [points], ``ring``
+    [RINGS + 1]: room to work in.
     """
 
     corner: Floats
@@ -59,6 +59,7 @@ class Polygons(NamedTuple):
     limit: Floats
     value: Floats
     order: Steps
+    far: Floats
     ring: Steps
 
 
@@ -106,9 +107,10 @@ def _clipped(
 
 
 @inlined
-def _by_distance(v: Floats, n: int, reach: float, ring: Steps, order: Steps) -> None:
-    """Numbers of the points by growing |v|, to ``order`` [n]: by rings, ``ring`` [RINGS + 1], then
-    by insertion."""
+def _by_distance(v: Floats, n: int, reach: float, polygons: Polygons) -> None:
+    """Numbers of the points by growing |v|, to ``order`` [n], and |v|, to ``far`` [n]: by rings,
+    then by insertion."""
+    order, distance, ring = polygons.order, polygons.far, polygons.ring
     ring[:] = 0
     scale = RINGS / reach
     for i in range(n):
@@ -117,15 +119,14 @@ def _by_distance(v: Floats, n: int, reach: float, ring: Steps, order: Steps) -> 
         ring[k + 1] += ring[k]
     for i in range(n):
         k = min(np.int64(abs(v[i]) * scale), RINGS - 1)
-        order[ring[k]] = i
+        order[ring[k]], distance[ring[k]] = i, abs(v[i])
         ring[k] += 1
     for at in range(1, n):
-        i, k = order[at], at
-        far = abs(v[i])
-        while k > 0 and abs(v[order[k - 1]]) > far:
-            order[k] = order[k - 1]
+        i, far, k = order[at], distance[at], at
+        while k > 0 and distance[k - 1] > far:
+            order[k], distance[k] = order[k - 1], distance[k - 1]
             k -= 1
-        order[k] = i
+        order[k], distance[k] = i, far
 
 
 @inlined
@@ -138,11 +139,16 @@ def _intersection(sides: Sides, n: int, band: Band, polygons: Polygons, s: int) 
     """
     u, v, is_high = sides.u, sides.v, sides.is_high
     corner, size, last, limit = polygons.corner, polygons.size, polygons.last, polygons.limit
-    value, order, width, slack = polygons.value, polygons.order, band.width, band.slack
+    value, order, distance = polygons.value, polygons.order, polygons.far
+    width, slack = band.width, band.slack
     m, first = size[s], last[s]
     for at in range(n):
-        i = order[at]
-        far = abs(v[i])
+        i, far = order[at], distance[at]
+        if far > max(limit[0], limit[1]):
+            break
+        side = 1 if v[i] >= 0.0 else 0
+        if (far <= first) | (far > limit[side]):
+            continue
         low, top = np.inf, -np.inf
         for j in range(m):
             here = corner[s, 0, j] + corner[s, 1, j] * v[i]
@@ -151,9 +157,7 @@ def _intersection(sides: Sides, n: int, band: Band, polygons: Polygons, s: int) 
         # most points bound none of the lines that are left
         bounds_low = (low < u[i] - slack) & (u[i] <= top + width)
         bounds_high = (top > u[i] + slack) & (u[i] >= low - width)
-        side = 1 if v[i] >= 0.0 else 0
-        known = (far <= first) | (far > limit[side])
-        if known | (not (bounds_high if is_high[i] else bounds_low)):
+        if not (bounds_high if is_high[i] else bounds_low):
             continue
         sign = 1.0 if is_high[i] else -1.0
         corners = _clipped(corner, s, m, s + 1, value, sign, sign * u[i] + slack)
@@ -221,7 +225,7 @@ def feasible_lines(sides: Sides, n: int, extent: float, band: Band, polygons: Po
         corner[0, 1, j] = STEEPEST if j > 1 else -STEEPEST
     size[0], last[0] = 4, -1.0
     limit[:] = band.reach
-    _by_distance(sides.v, n, band.reach, polygons.ring, polygons.order)
+    _by_distance(sides.v, n, band.reach, polygons)
     s = _intersection(sides, n, band, polygons, 0)
     if limit[0] < band.reach or limit[1] < band.reach:
         for side in range(2):

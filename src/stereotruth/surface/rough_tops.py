@@ -33,18 +33,17 @@ _ROOT_3 = np.sqrt(3.0)
 
 
 class _Squares(NamedTuple):
-    """Vertices by squares of ``side`` parts of a cell, ``cols`` in a row: those of square k are
-    ``member[start[k] : start[k + 1]]``, in their order."""
+    """Vertices by squares, ``cols`` in a row: those of square k are ``member[start[k] : start[k +
+    1]]``, in their order."""
 
     start: Steps
     member: Steps
-    side: int
     cols: int
 
 
 @kernel
 def _by_square(x: Ints, y: Ints, side: int, cols: int, rows: int) -> tuple[Steps, Steps]:
-    """``start`` and ``member`` of :class:`_Squares`."""
+    """``start`` and ``member`` of :class:`_Squares` of ``side`` parts of a cell."""
     start = np.zeros(rows * cols + 1, np.int32)
     for k in range(x.size):
         start[y[k] // side * cols + x[k] // side + 1] += 1
@@ -73,34 +72,41 @@ def _sector(dx: int, dy: int) -> int:
 def _passed(vertices: Vertices, squares: _Squares, radius: float, lift: float) -> Bools:
     """Which vertices lie below a surface around them, lower than it by ``lift`` (lattice steps):
     see SECTORS."""
-    x, y, h = vertices.x, vertices.y, vertices.h_q
-    start, member, side, cols = squares.start, squares.member, squares.side, squares.cols
-    out = np.zeros(x.size, np.bool_)
+    start, member, cols = squares.start, squares.member, squares.cols
+    # in the order of their squares, as they are looked at
+    x, y, h = (
+        vertices.x[member].astype(np.int32),
+        vertices.y[member].astype(np.int32),
+        vertices.h_q[member].astype(np.int32),
+    )
+    out = np.zeros(member.size, np.bool_)
     rows = (start.size - 1) // cols
+    reach, higher_by = np.int32(radius * radius), np.int32(np.floor(lift))
     filled = np.empty(SECTORS, np.bool_)
-    for k in range(x.size):
-        filled[:] = False
-        higher = others = 0
-        j, i = y[k] // side, x[k] // side
-        for b in range(max(j - 1, 0), min(j + 2, rows)):
-            for a in range(max(i - 1, 0), min(i + 2, cols)):
-                for m in range(start[b * cols + a], start[b * cols + a + 1]):
-                    v = member[m]
-                    dx, dy = x[v] - x[k], y[v] - y[k]
-                    if v == k or float(dx * dx + dy * dy) > radius * radius:
-                        continue
-                    if h[v] - h[k] > lift:
-                        higher += 1
-                        filled[_sector(dx, dy)] = True
-                    else:
-                        others += 1
-        if higher < FEWEST_HIGHER or higher < others:
-            continue
-        empty = widest = 0
-        for s in range(2 * SECTORS):
-            empty = 0 if filled[s % SECTORS] else empty + 1
-            widest = max(widest, empty)
-        out[k] = widest <= WIDEST_GAP
+    for j in range(rows):
+        for i in range(cols):
+            west, east = max(i - 1, 0), min(i + 2, cols)
+            for k in range(start[j * cols + i], start[j * cols + i + 1]):
+                higher = inside = np.int32(0)
+                for b in range(max(j - 1, 0), min(j + 2, rows)):
+                    for v in range(start[b * cols + west], start[b * cols + east]):
+                        dx, dy = x[v] - x[k], y[v] - y[k]
+                        near = np.int32(dx * dx + dy * dy <= reach)
+                        inside += near
+                        higher += near & np.int32(h[v] - h[k] > higher_by)
+                if higher < FEWEST_HIGHER or higher < inside - 1 - higher:  # itself is inside
+                    continue
+                filled[:] = False
+                for b in range(max(j - 1, 0), min(j + 2, rows)):
+                    for v in range(start[b * cols + west], start[b * cols + east]):
+                        dx, dy = x[v] - x[k], y[v] - y[k]
+                        if h[v] - h[k] > higher_by and dx * dx + dy * dy <= reach:
+                            filled[_sector(dx, dy)] = True
+                empty = widest = 0
+                for s in range(2 * SECTORS):
+                    empty = 0 if filled[s % SECTORS] else empty + 1
+                    widest = max(widest, empty)
+                out[member[k]] = widest <= WIDEST_GAP
     return out
 
 
@@ -171,7 +177,7 @@ def rough_tops(vertices: Vertices, near_undecided: Bools, scale: SurfaceScale) -
     radius = ROUGH_REACH * scale.spacing
     side = int(np.ceil(radius))
     cols, rows = (int(v.max(initial=0)) // side + 1 for v in (points.x, points.y))
-    squares = _Squares(*_by_square(points.x, points.y, side, cols, rows), side, cols)
+    squares = _Squares(*_by_square(points.x, points.y, side, cols, rows), cols)
     top = np.flatnonzero(~_passed(points, squares, radius, height_steps(scale.passed_m)))
     tops = points.taken(top)
     triangles = triangulate(tops.x, tops.y, scale.facet_radius)

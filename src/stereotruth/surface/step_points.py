@@ -57,6 +57,21 @@ class Nearby(NamedTuple):
     dy: Floats
 
 
+class Around(NamedTuple):
+    """Points around a centroid, in columns, so that loops take several at once: offsets, height,
+    whether there is a plane; position ``across`` and ``along`` the step, whether each ``counts``
+    for the breakline and ``is_high``, on the upper plane."""
+
+    dx: Floats
+    dy: Floats
+    height: Steps
+    has_plane: Bools
+    across: Floats
+    along: Floats
+    counts: Bools
+    is_high: Bools
+
+
 @kernel
 def _fill_blocks(x: Ints, y: Ints, vertex: Ints, first: Steps) -> None:
     """Number of the first vertex of each block, see :class:`StepPoints`."""
@@ -174,6 +189,38 @@ def sums_of_sides(
 
 
 @inlined
+def _tell_sides(
+    around: Around,
+    n: int,
+    planes: Floats,
+    normal: tuple[float, float],
+    radius: float,
+    widest: float,
+    spacing: float,
+    residual: float,
+) -> tuple[int, int]:
+    """Fills the last four columns of ``n`` points; least and greatest height within ``radius``."""
+    dx, dy, height, has_plane = around.dx, around.dy, around.height, around.has_plane
+    across, along, counts, is_high = around.across, around.along, around.counts, around.is_high
+    nx, ny = normal
+    low_h, low_x, low_y = planes[0, 0], planes[0, 1], planes[0, 2]
+    high_h, high_x, high_y = planes[1, 0], planes[1, 1], planes[1, 2]
+    least, most = np.int32(np.iinfo(np.int32).max), np.int32(np.iinfo(np.int32).min)
+    for k in range(n):
+        px, py, h = dx[k], dy[k], height[k]
+        r2 = px * px + py * py
+        inside = r2 <= radius * radius
+        least = min(least, h if inside else least)
+        most = max(most, h if inside else most)
+        u, v = nx * px + ny * py, nx * py - ny * px
+        low, high = low_h + low_x * px + low_y * py, high_h + high_x * px + high_y * py
+        on_one, on_high = _on_plane(float(h), low, high, r2, spacing, residual)
+        across[k], along[k], is_high[k] = u, v, on_high
+        counts[k] = inside & on_one & (u <= widest + STEEPEST * abs(v)) & has_plane[k]
+    return least, most
+
+
+@inlined
 def points_of_sides(
     points: StepPoints,
     centre: Centroid,
@@ -183,6 +230,7 @@ def points_of_sides(
     widest: float,
     spacing: float,
     residual: float,
+    around: Around,
     sides: Sides,
 ) -> tuple[int, int, int]:
     """Positions of the points on either plane across and along the step, to ``sides``; their
@@ -193,28 +241,28 @@ def points_of_sides(
     bound the breakline nor show a gap.
     """
     position, first = points.position, points.first
+    dx, dy, height, has_plane = around.dx, around.dy, around.height, around.has_plane
     u, v, is_high = sides.u, sides.v, sides.is_high
     ax, ay, ox, oy = centre.x, centre.y, centre.off_x, centre.off_y
-    nx, ny = normal
-    m = 0
+    m = n = 0
     least, most = np.int32(np.iinfo(np.int32).max), np.int32(np.iinfo(np.int32).min)
     mid_x, mid_y = float(ax) + ox, float(ay) + oy
     bottom = max(np.int64(mid_y - radius) >> PART_BITS, 0)
     top = min((np.int64(mid_y + radius) >> PART_BITS) + 1, first.shape[0])
     for row in range(bottom, top):
         begin, end = _row_of_disc(first, row, mid_x, mid_y, radius)
-        for k in range(begin, min(end, begin + MOST_STEP_POINTS - m)):
-            px, py = float(position[k, 0] - ax) - ox, float(position[k, 1] - ay) - oy
-            r2 = px * px + py * py
-            inside = r2 <= radius * radius
-            height = position[k, 2]
-            least = min(least, height) if inside else least
-            most = max(most, height) if inside else most
-            across, along = nx * px + ny * py, nx * py - ny * px
-            low = planes[0, 0] + planes[0, 1] * px + planes[0, 2] * py
-            high = planes[1, 0] + planes[1, 1] * px + planes[1, 2] * py
-            on_one, on_high = _on_plane(float(height), low, high, r2, spacing, residual)
-            u[m], v[m], is_high[m] = across, along, on_high
-            bounds = across <= widest + STEEPEST * abs(along)
-            m += inside & on_one & bounds & (position[k, 3] != 0)
+        for k in range(begin, min(end, begin + MOST_STEP_POINTS)):
+            dx[n], dy[n] = float(position[k, 0] - ax) - ox, float(position[k, 1] - ay) - oy
+            height[n], has_plane[n] = position[k, 2], position[k, 3] != 0
+            n += 1
+        if n < MOST_STEP_POINTS and row + 1 < top:
+            continue
+        low, high = _tell_sides(
+            around, n, planes, normal, radius, widest, spacing, residual
+        )  # fmt: skip
+        least, most = min(least, low), max(most, high)
+        for k in range(n):
+            u[m], v[m], is_high[m] = around.across[k], around.along[k], around.is_high[k]
+            m = min(m + around.counts[k], MOST_STEP_POINTS - 1)
+        n = 0
     return m, least, most
