@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inlined, inner, kernel
+from ..core.kernels import inlined, kernel
 from .delaunay import Triangles
 from .feasible_lines import MOST_CORNERS, POLYGONS, RINGS, Band, Polygons, Sides, feasible_lines
 from .scale import BREAKLINE_REACH, PART, SurfaceScale, height_steps
@@ -40,6 +40,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
+Corners = tuple[int, int, int]  # of a triangle
 
 NEAR_SPACINGS = 3.0  # within which points determine heights and the direction of a step
 BAND_SPACINGS = 2.5  # and how far off the breakline points still bound it
@@ -122,10 +123,10 @@ def _height_at(planed: Planed, w: int, centre: Centroid) -> float:
     return float(planed.h[w]) + planed.slopes[w, 0] * u + planed.slopes[w, 1] * v
 
 
-@inner
+@inlined
 def _explaining_vertex(
     planed: Planed,
-    corner: Steps,
+    corner: Corners,
     one: int,
     one_h: float,
     centre: Centroid,
@@ -171,7 +172,7 @@ def _explaining_vertex(
 @inlined
 def _two_planes(
     planed: Planed,
-    corner: Steps,
+    corner: Corners,
     centre: Centroid,
     points: StepPoints,
     limits: _Limits,
@@ -213,7 +214,7 @@ def _two_planes(
 @inlined
 def _fits_corners(
     planed: Planed,
-    corner: Steps,
+    corner: Corners,
     centre: Centroid,
     planes: Floats,
     line: tuple[float, float, float, float],
@@ -243,7 +244,7 @@ def _fits_corners(
 @inlined
 def _mean_line(
     planed: Planed,
-    corner: Steps,
+    corner: Corners,
     centre: Centroid,
     normal: tuple[float, float],
     polygons: Polygons,
@@ -311,14 +312,14 @@ def _fill_breaklines(
     x, y = planed.x, planed.y
     for t in range(len(corner)):
         out.line[t, 3] = np.nan
-        a, b, c = corner[t]
+        a, b, c = abc = corner[t, 0], corner[t, 1], corner[t, 2]
         area = float((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
         if area < 2.0 * SMALLEST_AREA * spacing * spacing:
             continue
         ox = float(x[b] - x[a] + x[c] - x[a]) / 3.0
         oy = float(y[b] - y[a] + y[c] - y[a]) / 3.0
         centre = Centroid(x[a], y[a], ox, oy)
-        low, top, n = _two_planes(planed, corner[t], centre, points, limits, near, planes)
+        low, top, n = _two_planes(planed, abc, centre, points, limits, near, planes)
         if low < 0 or not sums_of_sides(points, planes, near, n, spacing, residual, sums):
             continue
         nx = sums[1, 1] / sums[1, 0] - sums[0, 1] / sums[0, 0]
@@ -332,15 +333,15 @@ def _fill_breaklines(
             points, centre, planes, normal, reach, extent + width, spacing, residual, around, sides
         )  # fmt: skip
         s = feasible_lines(sides, m, extent, band, polygons)
-        line = _mean_line(planed, corner[t], centre, normal, polygons, s)
+        line = _mean_line(planed, abc, centre, normal, polygons, s)
         if line[3] > WIDEST_STRIP * spacing:
             continue
-        if not _fits_corners(planed, corner[t], centre, planes, line, residual):
+        if not _fits_corners(planed, abc, centre, planes, line, residual):
             continue
         for k in range(4):
             out.line[t, k] = line[k]
         for side in range(2):
-            level, gx, gy = planes[side]
+            level, gx, gy = planes[side, 0], planes[side, 1], planes[side, 2]
             level += sums[side, 3] / sums[side, 0]
             out.planes[t, 3 * side] = level - gx * ox - gy * oy
             out.planes[t, 3 * side + 1], out.planes[t, 3 * side + 2] = gx, gy

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, kernel
 from .breaklines import Breaklines
 from .feasible_lines import clip
 from .scale import PART
@@ -38,24 +38,24 @@ class Pieces(NamedTuple):
     heights: Floats
 
 
-@inner
+@inlined
 def _cut_facets(
     corner: tuple[Floats, Floats],
-    line: Floats,
-    planes: Floats,
+    lines: Breaklines,
     room: tuple[Floats, Floats],
     t: int,
     n: int,
     out: Pieces,
 ) -> int:
     """The parts of a triangle on either side of its strip, from part ``n`` on; where they end."""
-    p, q, r, w = line
-    lowest, highest = planes[6], planes[7]
+    line, planes = lines.line, lines.planes
+    p, q, r, w = line[t, 0], line[t, 1], line[t, 2], line[t, 3]
+    lowest, highest = planes[t, 6], planes[t, 7]
     ax, ay = room
     for side in range(2):
         sign = 1.0 if side == 0 else -1.0
         m = clip(corner[0], corner[1], 3, sign * p, sign * q, sign * r - w, ax, ay)
-        level, gx, gy = planes[3 * side], planes[3 * side + 1], planes[3 * side + 2]
+        level, gx, gy = planes[t, 3 * side], planes[t, 3 * side + 1], planes[t, 3 * side + 2]
         for j in range(1, m - 1):
             for at, c in enumerate((0, j, j + 1)):
                 out.facet[n, at, 0], out.facet[n, at, 1] = ax[c], ay[c]
@@ -73,21 +73,21 @@ def _cut(x: Ints, y: Ints, corner: Steps, lines: Breaklines, out: Pieces) -> tup
     px, py = np.empty(8), np.empty(8)
     ax, ay = np.empty(8), np.empty(8)
     bx, by = np.empty(8), np.empty(8)
+    line, planes = lines.line, lines.planes
     n = k = 0
     for t in range(len(corner)):
-        planes = lines.planes[t]
-        p, q, r, w = lines.line[t]
-        lowest, highest = planes[6], planes[7]
+        p, q, r, w = line[t, 0], line[t, 1], line[t, 2], line[t, 3]
+        lowest, highest = planes[t, 6], planes[t, 7]
         for i in range(3):
             v = corner[t, i]
             px[i], py[i] = float(x[v] - x[corner[t, 0]]), float(y[v] - y[corner[t, 0]])
-        n = _cut_facets((px, py), lines.line[t], planes, (ax, ay), t, n, out)
+        n = _cut_facets((px, py), lines, (ax, ay), t, n, out)
         m = clip(px, py, 3, p, q, r + w, ax, ay)
         m = clip(ax, ay, m, -p, -q, w - r, bx, by)
         bottom, top = np.inf, -np.inf
         for c in range(m):
-            bottom = min(bottom, planes[0] + planes[1] * bx[c] + planes[2] * by[c])
-            top = max(top, planes[3] + planes[4] * bx[c] + planes[5] * by[c])
+            bottom = min(bottom, planes[t, 0] + planes[t, 1] * bx[c] + planes[t, 2] * by[c])
+            top = max(top, planes[t, 3] + planes[t, 4] * bx[c] + planes[t, 5] * by[c])
         for j in range(1, m - 1):
             for at, c in enumerate((0, j, j + 1)):
                 out.strip[k, at, 0], out.strip[k, at, 1] = bx[c], by[c]

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -43,14 +43,14 @@ NEAR = 1 << 30  # square parts: of vertices that near each other the test needs 
 # ---------------------------------------------------------------------------------- exact tests
 
 
-@inner
+@inlined
 def _turn(at: Places, a: int, b: int, c: int) -> int:
     """Twice the signed area of a triangle: positive if it runs counter-clockwise."""
     x, y = np.int64(at[a, 0]), np.int64(at[a, 1])
     return (at[b, 0] - x) * (at[c, 1] - y) - (at[b, 1] - y) * (at[c, 0] - x)
 
 
-@inner
+@inlined
 def _in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     """Whether ``d`` lies in the circumcircle of the counter-clockwise (a, b, c); never a tie."""
     x, y = np.int64(at[d, 0]), np.int64(at[d, 1])
@@ -74,7 +74,7 @@ def _in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     return _tie_in_circle(at, a, b, c, d)
 
 
-@inner
+@inlined
 def _tie_in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     """:func:`_in_circle` of cocircular vertices: the one of the highest rank is lifted most. Its
     cofactor decides, or, where the other three lie on a line, that of the next."""
@@ -100,7 +100,7 @@ def _tie_in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     return False
 
 
-@inner
+@inlined
 def _before(at: Places, s: int, t: int) -> bool:
     return at[s, 1] < at[t, 1] or (at[s, 1] == at[t, 1] and at[s, 0] < at[t, 0])
 
@@ -167,20 +167,20 @@ def _insertion_order(x: Ints, y: Ints, bits: int) -> Steps:
     return order
 
 
-@inner
+@inlined
 def _side(mesh: Steps, t: int, other: int) -> int:
     """Beside which side of triangle ``t`` another lies; without branches, which the processor could
     not predict."""
     return np.int64(mesh[t, BESIDE + 1] == other) + 2 * np.int64(mesh[t, BESIDE + 2] == other)
 
 
-@inner
+@inlined
 def _replace(mesh: Steps, t: int, old: int, new: int) -> None:
     if t >= 0:
         mesh[t, BESIDE + _side(mesh, t, old)] = new
 
 
-@inner
+@inlined
 def _set(mesh: Steps, t: int, v: tuple, n: tuple) -> None:
     mesh[t, 0], mesh[t, 1], mesh[t, 2] = v
     mesh[t, BESIDE], mesh[t, BESIDE + 1], mesh[t, BESIDE + 2] = n
@@ -292,7 +292,7 @@ class Triangles(NamedTuple):
     radius: Floats
 
 
-@inner
+@inlined
 def _circumradius(at: Places, a: int, b: int, c: int) -> float:
     u, v = float(at[b, 0] - at[a, 0]), float(at[b, 1] - at[a, 1])
     s, t = float(at[c, 0] - at[b, 0]), float(at[c, 1] - at[b, 1])

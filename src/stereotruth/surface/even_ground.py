@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, inner, kernel
 from .scale import PART, SQUARE_CELLS
 
 Floats = NDArray[np.float64]
@@ -94,7 +94,7 @@ def _by_square(square: Steps, start: Steps) -> Steps:
     return out
 
 
-@inner
+@inlined
 def _enough(start: Steps, s: int, cols: int) -> bool:
     """Whether a square and the eight around it hold enough vertices."""
     if start[s + 1] - start[s] < FEWEST_VERTICES:
@@ -108,7 +108,7 @@ def _enough(start: Steps, s: int, cols: int) -> bool:
     return around >= FEWEST_AROUND
 
 
-@inner
+@inlined
 def _moments(position: Steps, start: Steps, first: int, out: Ints) -> None:
     """Of a row of squares from square ``first`` on: sums over the vertices of each to ``out``.
 
@@ -129,7 +129,7 @@ def _moments(position: Steps, start: Steps, first: int, out: Ints) -> None:
         row[4], row[5], row[6], row[7] = suv, svv, suw, svw
 
 
-@inner
+@inlined
 def _plane(
     squares: _InSquares, moments: Ints, s: int, row: int, cols: int, tolerance: float
 ) -> tuple[bool, float, float]:

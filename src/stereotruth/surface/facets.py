@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, kernel
 from .delaunay import Triangles
 from .scale import HEIGHT_NOISE_M, PART, PRIOR_NOISE_M, SurfaceScale, height_steps
 from .vertices import Vertices
@@ -60,7 +60,7 @@ def height_variances() -> tuple[float, float]:
     return height_steps(PRIOR_NOISE_M) ** 2, height_steps(HEIGHT_NOISE_M) ** 2
 
 
-@inner
+@inlined
 def _slopes(x: Ints, y: Ints, h: Ints, a: int, b: int, c: int) -> tuple[float, float, float]:
     """Slopes of a triangle (eq. 1 of docs/explanation/surface.md), and twice its area."""
     u, v, s, t = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
@@ -69,14 +69,14 @@ def _slopes(x: Ints, y: Ints, h: Ints, a: int, b: int, c: int) -> tuple[float, f
     return float(p * t - q * v) / area, float(q * u - p * s) / area, area
 
 
-@inner
+@inlined
 def _far_vertex(corner: Steps, t: int, i: int, u: int) -> int:
     """The vertex of triangle u, opposite vertex i of triangle t, that t has not."""
     shared = corner[t, 0] + corner[t, 1] + corner[t, 2] - corner[t, i]
     return corner[u, 0] + corner[u, 1] + corner[u, 2] - shared
 
 
-@inner
+@inlined
 def _residual(x: Ints, y: Ints, h: Ints, v: int, w: int, gx: float, gy: float) -> float:
     """Height of vertex w above the plane of slopes (gx, gy) through vertex v (eq. 2 of
     docs/explanation/surface.md)."""
@@ -94,7 +94,7 @@ def _vertex_slopes(
     for t in range(len(corner)):
         if not chosen[t]:
             continue
-        a, b, c = corner[t]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         gx, gy, area = _slopes(x, y, h, a, b, c)
         longest = 0
         for p, q in ((a, b), (b, c), (c, a)):
@@ -200,7 +200,7 @@ def _domes(
     corner, neighbour = triangles.corner, triangles.neighbour
     out = np.zeros(len(corner), np.bool_)
     for t in range(len(corner)):
-        a, b, c = corner[t]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         low, high = min(h[a], h[b], h[c]), max(h[a], h[b], h[c])
         good = small[t] and high - low <= height
         for v, w, u in ((a, b, c), (b, c, a), (c, a, b)):
@@ -274,7 +274,7 @@ def _residual_sums(
     for t in range(len(corner)):
         if not is_facet[t]:
             continue
-        a, b, c = corner[t]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         gx, gy, area = _slopes(x, y, h, a, b, c)
         for i in range(3):
             u = neighbour[t, i]

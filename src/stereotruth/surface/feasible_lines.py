@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inlined, inner
+from ..core.kernels import inlined
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -63,7 +63,7 @@ class Polygons(NamedTuple):
     ring: Steps
 
 
-@inner
+@inlined
 def clip(a: Floats, b: Floats, n: int, p: float, q: float, r: float, c: Floats, d: Floats) -> int:
     """The part of a convex polygon (a, b)[n] with p a + q b <= r, to (c, d); its corners."""
     m = 0

@@ -122,7 +122,7 @@ def _rms_residuals(vertices: Vertices, triangles: Triangles, chosen: Bools) -> F
     for t in range(size):
         if not chosen[t]:
             continue
-        a, b, c = corner[t]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         u, v, s, w = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
         area = float(u * w - v * s)
         for i in range(3):

@@ -196,7 +196,7 @@ def _near_undecided(corner: Steps, is_facet: Bools, vertices: int) -> Bools:
             for i in range(3):
                 of_undecided[corner[t, i]] = True
     for t in range(len(corner)):
-        a, b, c = corner[t]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         if of_undecided[a] or of_undecided[b] or of_undecided[c]:
             out[a] = out[b] = out[c] = True
     return out
