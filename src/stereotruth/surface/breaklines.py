@@ -293,7 +293,7 @@ def _fill_breaklines(
     most = 2 * MOST_STEP_POINTS
     around = Around(
         np.empty(most), np.empty(most), np.empty(most, np.int32), np.empty(most, np.bool_),
-        np.empty(most), np.empty(most), np.empty(most, np.bool_), np.empty(most, np.bool_),
+        np.empty(most, np.uint8),
     )  # fmt: skip
     polygons = Polygons(
         np.empty((POLYGONS + 1, 2, MOST_CORNERS)),

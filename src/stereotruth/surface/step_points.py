@@ -23,6 +23,7 @@ Bools = NDArray[np.bool_]
 
 BLOCK_BITS = PART_BITS + 3  # of parts of a cell: vertices of a row are found by such blocks
 MOST_STEP_POINTS = 4096  # that determine a breakline, at most
+INSIDE, COUNTS, HIGH = 1, 2, 4  # within reach; on a plane, for the breakline; on the high one
 BEYOND_SHARE = 0.08  # with more points below the low and above the high plane, these are crowns
 
 
@@ -58,18 +59,14 @@ class Nearby(NamedTuple):
 
 
 class Around(NamedTuple):
-    """Points around a centroid, in columns, so that loops take several at once: offsets, height,
-    whether there is a plane; position ``across`` and ``along`` the step, whether each ``counts``
-    for the breakline and ``is_high``, on the upper plane."""
+    """Points around a centroid: offsets, height, whether there is a plane; in ``side``, what
+    :func:`_tell_sides` says."""
 
     dx: Floats
     dy: Floats
     height: Steps
     has_plane: Bools
-    across: Floats
-    along: Floats
-    counts: Bools
-    is_high: Bools
+    side: NDArray[np.uint8]
 
 
 @kernel
@@ -198,26 +195,24 @@ def _tell_sides(
     widest: float,
     spacing: float,
     residual: float,
-) -> tuple[int, int]:
-    """Fills the last four columns of ``n`` points; least and greatest height within ``radius``."""
-    dx, dy, height, has_plane = around.dx, around.dy, around.height, around.has_plane
-    across, along, counts, is_high = around.across, around.along, around.counts, around.is_high
+) -> None:
+    """The :data:`INSIDE`, :data:`COUNTS` and :data:`HIGH` of ``n`` points, to ``side``.
+
+    Nothing else, so that the compiler takes several points at once.
+    """
+    dx, dy, height, side = around.dx, around.dy, around.height, around.side
     nx, ny = normal
     low_h, low_x, low_y = planes[0, 0], planes[0, 1], planes[0, 2]
     high_h, high_x, high_y = planes[1, 0], planes[1, 1], planes[1, 2]
-    least, most = np.int32(np.iinfo(np.int32).max), np.int32(np.iinfo(np.int32).min)
     for k in range(n):
-        px, py, h = dx[k], dy[k], height[k]
+        px, py = dx[k], dy[k]
         r2 = px * px + py * py
         inside = r2 <= radius * radius
-        least = min(least, h if inside else least)
-        most = max(most, h if inside else most)
-        u, v = nx * px + ny * py, nx * py - ny * px
+        across, along = nx * px + ny * py, nx * py - ny * px
         low, high = low_h + low_x * px + low_y * py, high_h + high_x * px + high_y * py
-        on_one, on_high = _on_plane(float(h), low, high, r2, spacing, residual)
-        across[k], along[k], is_high[k] = u, v, on_high
-        counts[k] = inside & on_one & (u <= widest + STEEPEST * abs(v)) & has_plane[k]
-    return least, most
+        on_one, on_high = _on_plane(float(height[k]), low, high, r2, spacing, residual)
+        counts = inside & on_one & (across <= widest + STEEPEST * abs(along))
+        side[k] = (INSIDE if inside else 0) + (COUNTS if counts else 0) + (HIGH if on_high else 0)
 
 
 @inlined
@@ -242,8 +237,9 @@ def points_of_sides(
     """
     position, first = points.position, points.first
     dx, dy, height, has_plane = around.dx, around.dy, around.height, around.has_plane
-    u, v, is_high = sides.u, sides.v, sides.is_high
+    side, u, v, is_high = around.side, sides.u, sides.v, sides.is_high
     ax, ay, ox, oy = centre.x, centre.y, centre.off_x, centre.off_y
+    nx, ny = normal
     m = n = 0
     least, most = np.int32(np.iinfo(np.int32).max), np.int32(np.iinfo(np.int32).min)
     mid_x, mid_y = float(ax) + ox, float(ay) + oy
@@ -257,12 +253,13 @@ def points_of_sides(
             n += 1
         if n < MOST_STEP_POINTS and row + 1 < top:
             continue
-        low, high = _tell_sides(
-            around, n, planes, normal, radius, widest, spacing, residual
-        )  # fmt: skip
-        least, most = min(least, low), max(most, high)
+        _tell_sides(around, n, planes, normal, radius, widest, spacing, residual)
         for k in range(n):
-            u[m], v[m], is_high[m] = around.across[k], around.along[k], around.is_high[k]
-            m = min(m + around.counts[k], MOST_STEP_POINTS - 1)
+            inside, counts = side[k] & INSIDE != 0, side[k] & COUNTS != 0
+            least = min(least, height[k] if inside else least)
+            most = max(most, height[k] if inside else most)
+            u[m], v[m] = nx * dx[k] + ny * dy[k], nx * dy[k] - ny * dx[k]
+            is_high[m] = side[k] & HIGH != 0
+            m = min(m + (counts & has_plane[k]), MOST_STEP_POINTS - 1)
         n = 0
     return m, least, most
