@@ -86,22 +86,21 @@ def _clipped(
 ) -> int:
     """The part of polygon ``s`` of ``m`` corners with sign * value <= bound, to polygon ``new``.
 
-    ``value`` of each corner. Returns the number of corners.
+    ``value`` of each corner. Returns the number of corners. Without branches, which the processor
+    could not predict: what does not count is written over.
     """
     n = 0
     here = sign * value[0] - bound
     for i in range(m):
         k = i + 1 if i + 1 < m else 0
         there = sign * value[k] - bound
-        if here <= 0.0:
-            corner[new, 0, n], corner[new, 1, n] = corner[s, 0, i], corner[s, 1, i]
-            n += 1
-        if (here < 0.0 < there) or (there < 0.0 < here):
-            part = here / (here - there)
-            for axis in range(2):
-                start = corner[s, axis, i]
-                corner[new, axis, n] = start + part * (corner[s, axis, k] - start)
-            n += 1
+        a, b = corner[s, 0, i], corner[s, 1, i]
+        corner[new, 0, n], corner[new, 1, n] = a, b
+        n += here <= 0.0
+        part = here / (here - there)
+        corner[new, 0, n] = a + part * (corner[s, 0, k] - a)
+        corner[new, 1, n] = b + part * (corner[s, 1, k] - b)
+        n += ((here < 0.0) & (there > 0.0)) | ((there < 0.0) & (here > 0.0))
         here = there
     return n
 
