@@ -16,9 +16,8 @@ from ..core.kernels import kernel
 from ..core.numerics.box_max import box_max
 from ..lidar.lattice import LATTICE_DEG, LATTICE_M
 from ..lidar.smooth_maps import LocalProjection
-from ..surface.region import SQUARE_BITS, Region
 from ..surface.scale import PART_BITS
-from ..surface.surface_store import Block
+from ..surface.surface_store import SQUARE_BITS, Block, Region
 from ..surface.vertices import Vertices
 from .view_geometry import ViewGeometry
 

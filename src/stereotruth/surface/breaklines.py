@@ -5,7 +5,7 @@ straight over many points, so that the points on both sides along an edge say mu
 three of one triangle where it runs: of all lines that part the low from the high points around, as
 far along the edge as there is such a line (a corner ends it), the feasible ones form a convex set
 in (offset, slope), see :mod:`.feasible_lines`. The breakline lies within the span of this set. A
-triangle is cut there (:mod:`.cut_triangles`): what lies clearly on one side belongs to that
+triangle is cut there (:mod:`.surface`): what lies clearly on one side belongs to that
 surface's plane, the strip in between may hold any height between both.
 
 All follows from the points up to BREAKLINE_REACH around a triangle, in an order of theirs that no
@@ -21,19 +21,25 @@ from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
 from .delaunay import Triangles
-from .feasible_lines import MOST_CORNERS, POLYGONS, RINGS, Band, Polygons, Sides, feasible_lines
-from .scale import BREAKLINE_REACH, PART, SurfaceScale, height_steps
-from .step_points import (
+from .feasible_lines import (
+    MOST_CORNERS,
     MOST_STEP_POINTS,
+    POLYGONS,
+    RINGS,
     Around,
+    Band,
     Centroid,
     Nearby,
+    Polygons,
+    Sides,
     StepPoints,
+    feasible_lines,
     points_of_sides,
     points_within,
     step_points,
     sums_of_sides,
 )
+from .scale import BREAKLINE_REACH, PART, SurfaceScale, height_steps
 from .vertices import Vertices
 
 Floats = NDArray[np.float64]

@@ -292,6 +292,16 @@ class Triangles(NamedTuple):
     radius: Floats
 
 
+@kernel
+def height_ranges(h: Ints, corner: Steps) -> Ints:
+    """Least and greatest height [n, 2] of the vertices of triangles [n, 3]."""
+    out = np.empty((len(corner), 2), np.int64)
+    for t in range(len(corner)):
+        a, b, c = h[corner[t, 0]], h[corner[t, 1]], h[corner[t, 2]]
+        out[t, 0], out[t, 1] = min(a, b, c), max(a, b, c)
+    return out
+
+
 @inlined
 def _circumradius(at: Places, a: int, b: int, c: int) -> float:
     u, v = float(at[b, 0] - at[a, 0]), float(at[b, 1] - at[a, 1])

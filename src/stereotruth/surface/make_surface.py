@@ -1,11 +1,12 @@
 """The surface of a site, made once for all its pairs, block by block.
 
 A block is a square of ground cells on the global lattice, and has the triangles whose first vertex
-lies in the part of it that images show (:mod:`.shown_blocks`). Its bytes follow from this part and
-the points up to :attr:`.scale.SurfaceScale.halo_cells` around it, whatever blocks are made beside
-it, in which order and by how many workers. Blocks are small, since
-windows read them whole, and are made by groups that are wide against their halo. Finished groups
-outlive a killed job, and one more LiDAR file leaves those that it does not touch
+lies in it; of one that images show in part, those in the smallest box around what they may show
+(:class:`ShownBlocks`). Its content follows from this part and the points up to
+:attr:`.scale.SurfaceScale.halo_cells` around it, whatever blocks are made beside it, in which order
+and by how many workers. Blocks are small, since windows read them whole, and are made by groups
+that are wide against their halo; a group is a file. Finished groups outlive a killed job, and one
+more LiDAR file leaves those that it does not touch
 (:mod:`stereotruth.core.products.finished_pieces`).
 """
 
@@ -13,12 +14,13 @@ from __future__ import annotations
 
 import logging
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from io import BytesIO
+from itertools import chain, product
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,15 +36,16 @@ from ..core.products.provenance import describe, digest
 from ..lidar.density import points_per_m2
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
 from ..lidar.overlap_check import refuse_apart
-from ..lidar.point_store import PointStore
+from ..lidar.point_store import Points, PointStore
 from .scale import PART, SurfaceScale
-from .shown_blocks import Box, Number, ShownBlocks, ShownGround
 from .surface import Core, Parts, ground_surface
 from .surface_store import ATTRIBUTES, BLOCKS, CONTENTS, FORMAT, GROUPS, GroupWriter, table_of
 from .vertices import VertexBuilder
 
 log = logging.getLogger("stereotruth")
 Ints = NDArray[np.int64]
+Number = tuple[int, int]  # of a block (row, col), of a cell (col, row)
+Box = tuple[Number, Number]
 Group = tuple[Number, ...]  # of blocks, in their order
 
 BLOCK_SPACINGS = 128  # spacings of points along a block's side, at least,
@@ -120,11 +123,14 @@ class _Maker:
         high = (last[0] + halo) * cell[0] - 1, (last[1] + halo) * cell[1] - 1
         return low, high
 
+    def touched(self, parts: Mapping[Number, Box]) -> list[PointStore]:
+        """The stores that may have points which determine parts of blocks."""
+        ends = zip(chain(*self.corners(parts.values())), (-0.5, -0.5, 0.5, 0.5))
+        box = [(q + off) * LATTICE_DEG for q, off in ends]
+        return [store for store in self.stores if store.height_range(*box) is not None]
+
     def key(self, parts: Mapping[Number, Box]) -> str:
         """Digest of all that blocks follow from."""
-        low, high = self.corners(parts.values())
-        box = [(q + off) * LATTICE_DEG for q, off in zip((*low, *high), (-0.5, -0.5, 0.5, 0.5))]
-        touched = [store for store in self.stores if store.height_range(*box) is not None]
         return digest(
             {
                 "format": FORMAT,
@@ -132,7 +138,8 @@ class _Maker:
                 "side": self.side,
                 "blocks": list(parts.items()),
                 "points": sorted(
-                    (store.attrs["cells_crc32"], zlib.crc32(store.days)) for store in touched
+                    (store.attrs["cells_crc32"], zlib.crc32(store.days))
+                    for store in self.touched(parts)
                 ),
                 "code": self.code,
             }
@@ -141,14 +148,16 @@ class _Maker:
     def write(self, stream: BinaryIO, group: Group, parts: Mapping[Number, Box]) -> list[list]:
         """The triangles of each block that has any, and its row of the store's table."""
         low, high = self.corners(parts.values())
-        bounds = np.array([store.bounds[:4] for store in self.stores]) / LATTICE_DEG
+        if not (stores := self.touched(parts)):
+            return []
+        bounds = np.array([store.bounds[:4] for store in stores]) / LATTICE_DEG
         low = tuple(max(q, int(b) - 1) for q, b in zip(low, bounds[:, :2].min(axis=0)))
         high = tuple(min(q, int(b) + 1) for q, b in zip(high, bounds[:, 2:].max(axis=0)))
         if low[0] > high[0] or low[1] > high[1]:
             return []
         builder = VertexBuilder(self.scale, low, high)
         some = False
-        for points in self._points(low, high):
+        for points in _points(stores, low, high):
             some |= points.lon_q.size > 0
             lattice = points.lon_q, points.lat_q, points.h_q
             builder.add(*lattice, points.classification, points.return_number, points.day)
@@ -168,23 +177,24 @@ class _Maker:
                 writer.write(number, surface, (corner[0], corner[1]))
         return writer.rows
 
-    def _points(self, low: Number, high: Number) -> Iterable[Any]:
-        """The points of a box, row of the stores' cells by row."""
-        west, east = (low[0] - 0.5) * LATTICE_DEG, (high[0] + 0.5) * LATTICE_DEG
-        for row in range(low[1] >> CELL_BITS, (high[1] >> CELL_BITS) + 1):
-            south = max(row << CELL_BITS, low[1])
-            north = min(((row + 1) << CELL_BITS) - 1, high[1])
-            edges = (south - 0.5) * LATTICE_DEG, (north + 0.5) * LATTICE_DEG
-            for store in self.stores:
-                if len(points := store.query(west, edges[0], east, edges[1])):
-                    yield points
-
     def make(self, group: Group, parts: Mapping[Number, Box], key: str, done: Ledger) -> None:
         """A group and its record."""
         with atomic_file(self.file(group)) as scratch, scratch.open("wb") as stream:
             rows = self.write(stream, group, parts)
         refuse_replaced(marks_of_inputs())
         done.put(_name(group), key, {GROUPS: self.file(group)}, rows)
+
+
+def _points(stores: Sequence[PointStore], low: Number, high: Number) -> Iterator[Points]:
+    """The points of a box, row of the stores' cells by row."""
+    west, east = (low[0] - 0.5) * LATTICE_DEG, (high[0] + 0.5) * LATTICE_DEG
+    for row in range(low[1] >> CELL_BITS, (high[1] >> CELL_BITS) + 1):
+        south = max(row << CELL_BITS, low[1])
+        north = min(((row + 1) << CELL_BITS) - 1, high[1])
+        edges = (south - 0.5) * LATTICE_DEG, (north + 0.5) * LATTICE_DEG
+        for store in stores:
+            if len(points := store.query(west, edges[0], east, edges[1])):
+                yield points
 
 
 def _around(boxes: Iterable[Box]) -> Box:
@@ -286,3 +296,105 @@ def _groups(numbers: Sequence[Number], blocks: int) -> list[Group]:
     for number in numbers:
         groups.setdefault((number[0] // blocks, number[1] // blocks), []).append(number)
     return [tuple(group) for group in groups.values()]
+
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SQUARES = 8  # along the side of a block, each of which images show or not
+
+
+class ShownGround(Protocol):
+    """The ground that the images of a site show."""
+
+    def shows(self, lon: Floats, lat: Floats, height: Floats) -> Bools:
+        """Whether an image shows places [n] (degrees, degrees, m)."""
+
+    def may_show(self, boxes: Floats) -> Bools:
+        """Whether an image may show something of boxes [n, 6] (west, south, lowest, east, north,
+        highest)."""
+
+    def box(self, heights: tuple[float, float]) -> tuple[float, float, float, float]:
+        """West, south, east, north of what the images show between two heights, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShownBlocks:
+    """Blocks of ``side`` cells that images show of a ``ground``; without one, all that have points.
+
+    ``heights`` of the lowest and the highest point, m, of each of the point stores' cells by its
+    (col, row).
+    """
+
+    scale: SurfaceScale
+    side: int
+    ground: ShownGround | None
+    heights: Mapping[Number, tuple[float, float]]
+
+    @classmethod
+    def of(
+        cls,
+        stores: Sequence[PointStore],
+        scale: SurfaceScale,
+        side: int,
+        ground: ShownGround | None,
+    ) -> ShownBlocks:
+        """Of the points of stores."""
+        heights: dict[Number, tuple[float, float]] = {}
+        for store in stores:
+            cells = np.stack([store.cell_col, store.cell_row], axis=1).tolist()
+            own = (store.cell_heights * LATTICE_M).tolist()
+            for cell, (low, high) in zip(map(tuple, cells), own):
+                before = heights.get(cell, (low, high))
+                heights[cell] = min(low, before[0]), max(high, before[1])
+        return cls(scale, side, ground, heights)
+
+    def numbers(self) -> list[Number]:
+        """(row, col) of the blocks, in their order."""
+        size = np.array(self.scale.cell) * self.side
+        low = np.array(list(self.heights), np.int64).reshape(-1, 2) << CELL_BITS
+        high = low + (1 << CELL_BITS) - 1
+        every = sorted(set().union(*map(_numbers, low // size, high // size)))
+        if self.ground is None or not every:
+            return every
+        boxes = np.concatenate([self._boxes(number, 1) for number in every])
+        return [number for number, visible in zip(every, self.ground.may_show(boxes)) if visible]
+
+    def part(self, number: Number) -> Box:
+        """Of a block that images may show: (col, row) of the first cell that they may show, and of
+        that after the last one."""
+        first = np.array(number[::-1]) * self.side
+        low, high = first, first + self.side
+        if self.ground is not None:
+            visible = self.ground.may_show(self._boxes(number, SQUARES))
+            corners = first + _squares(SQUARES)[visible] * (self.side // SQUARES)
+            if len(corners):
+                low, high = corners.min(axis=0), corners.max(axis=0) + self.side // SQUARES
+        return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
+
+    def _boxes(self, number: Number, squares: int) -> Floats:
+        """Boxes [n, 6] (as of :meth:`ShownGround.may_show`) of the triangles whose first vertex
+        lies in each of the ``squares`` along the side of a block."""
+        cell, size = np.array(self.scale.cell), self.side // squares
+        reach = np.ceil(self.scale.height_reach / PART)
+        corners = np.array(number[::-1]) * self.side + _squares(squares) * size
+        low, high = (corners - reach) * cell, (corners + size + reach) * cell
+        first, last = (v.astype(np.int64) >> CELL_BITS for v in (low.min(axis=0), high.max(axis=0)))
+        cells = product(*(range(a, b + 1) for a, b in zip(first.tolist(), last.tolist())))
+        lowest, highest = zip(*(self.heights[cell] for cell in cells if cell in self.heights))
+        boxes = np.empty((len(corners), 6))
+        boxes[:, :2], boxes[:, 3:5] = low * LATTICE_DEG, high * LATTICE_DEG
+        boxes[:, 2], boxes[:, 5] = min(lowest), max(highest)
+        return boxes
+
+
+def _squares(squares: int) -> Ints:
+    """(col, row) [n, 2] of the squares of a block."""
+    return np.stack(np.mgrid[:squares, :squares], axis=-1).reshape(-1, 2)
+
+
+def _numbers(first: Ints, last: Ints) -> Iterator[Number]:
+    """Of blocks between two (col, row)."""
+    for col in range(int(first[0]), int(last[0]) + 1):
+        for row in range(int(first[1]), int(last[1]) + 1):
+            yield row, col
