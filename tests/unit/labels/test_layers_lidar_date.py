@@ -95,7 +95,7 @@ def test_bytes_are_the_same_for_any_blocks_windows_and_workers(box, tmp_path):
             open_stores([store]), folder / "s", cell=inputs.rays.cell, blocks_at_once=blocks
         )
         project_with(*box.images, [store], folder / "out.zarr", surface=folder / "s", **run)
-        digests.add((tree_digest(folder / "s/blocks"), tree_digest(folder / "out.zarr")))
+        digests.add((tree_digest(folder / "s/groups"), tree_digest(folder / "out.zarr")))
     assert len(digests) == 1
     days, metres = dates(tmp_path / "0/out.zarr", "left")
     assert (
