@@ -23,8 +23,8 @@ from kernel_rates import fastest
 from throughput import decode
 
 from stereocities.sites import drawn_site
+from stereotruth.project import example_city
 from stereotruth.project.new_project import begin
-from stereotruth.project.project import example_city
 
 RULES = (
     "ingest", "compare_strips", "surface", "align", "refine", "adjust", "adjusted_alignment",

@@ -49,7 +49,7 @@ KEYS: list[tuple[str, Any, set[str]]] = [
         {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY, *GRID_TRUTH},
     ),
     ("alignment.model", "shift", {*ALIGN, *RECTIFY, *GRID_TRUTH}),
-    ("stereotruth.align.refine", False, {*RECTIFY, *GRID_TRUTH}),
+    ("alignment.refine", False, {*RECTIFY, *GRID_TRUTH}),
     ("rectify.panchromatic", 1, {*REFINE, *RECTIFY, *GRID_TRUTH}),
     ("project.edge_margin_px", 1, {*PROJECT, *OF_TRUTH}),
     (

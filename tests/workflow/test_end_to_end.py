@@ -100,15 +100,15 @@ def test_an_edited_gcp_runs_what_follows_and_a_reverted_one_nothing(made, tmp_pa
 
 
 EDITED = {
-    "dataset/export": {"export"},
-    "disparity/project": {"project", "export"},
-    "epipolar/rectify": {"rectify", "project", "export"},
-    "epipolar/image_reader": {"refine", "rectify", "project", "export"},
-    "alignment/align": STAGES,
-    "surface/facets": {"surface", "project", "export"},
-    "lidar/ingest": STAGES - {"align"} | {"ingest", "compare_strips", "surface"},
-    "lidar/strip_planes": {"compare_strips", "project", "export"},
-    "sheets simulate/render": set(),
+    "stereotruth/tiles/export": {"export"},
+    "stereotruth/labels/project": {"project", "export"},
+    "stereotruth/epipolar/rectify": {"rectify", "project", "export"},
+    "stereotruth/sensor/image_reader": {"refine", "rectify", "project", "export"},
+    "stereotruth/align/align": STAGES,
+    "stereotruth/surface/facets": {"surface", "project", "export"},
+    "stereotruth/lidar/ingest": STAGES - {"align"} | {"ingest", "compare_strips", "surface"},
+    "stereotruth/lidar/strip_planes": {"compare_strips", "project", "export"},
+    "stereotruth/core/sheets stereocities/render": set(),
 }
 
 
@@ -118,7 +118,7 @@ def edited(made, tmp_path_factory) -> Project:
     project = made.copy(tmp_path_factory.mktemp("edited") / "project")
     project.edited = True
     for module in " ".join(EDITED).split():
-        with (project.folder / f"src/stereotruth/{module}.py").open("a") as stream:
+        with (project.folder / f"src/{module}.py").open("a") as stream:
             stream.write("\n# a remark is no change\n")
     return project
 
@@ -130,7 +130,7 @@ def test_remarks_in_the_code_run_nothing(edited):
 
 @pytest.mark.parametrize(("modules", "rules"), EDITED.items())
 def test_edited_code_runs_its_stage_and_what_follows(edited, modules, rules):
-    files = [edited.folder / f"src/stereotruth/{module}.py" for module in modules.split()]
+    files = [edited.folder / f"src/{module}.py" for module in modules.split()]
     before = {file: file.read_text() for file in files}
     try:
         for file, text in before.items():

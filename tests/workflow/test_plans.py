@@ -140,7 +140,7 @@ def test_a_scene_without_gcps_is_refused_unless_it_is_refined(project):
     mine = project.add_scene("mine", [row], alignment={"refine": False})
     run = project.snakemake("--dry-run", "tiles/Mine", "--configfile", mine)
     assert run.status != 0
-    for word in ("Mine-1", "no GCPs", "stereotruth.align.refine", "Remedy"):
+    for word in ("Mine-1", "no GCPs", "alignment.refine", "Remedy"):
         assert word in run.text
     jobs = project.plan("tiles/Mine", "--configfile", project.add_scene("mine", [row]))
     assert jobs["refine"] == 1

@@ -9,7 +9,7 @@ import pytest
 
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import EpipolarModel
-from stereotruth.project.project import add_scene, check_scene
+from stereotruth.project import add_scene, check_scene
 
 from ...synthetic.broken_scenes import good_project
 

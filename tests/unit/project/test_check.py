@@ -11,10 +11,10 @@ import rasterio
 from rich.console import Console
 
 from stereotruth.core.errors import InputError
+from stereotruth.project import check, check_scene
 from stereotruth.project.check import check_project
 from stereotruth.project.check_table import show
 from stereotruth.project.findings import Level
-from stereotruth.project.project import check, check_scene
 
 from ...synthetic.broken_scenes import DOUBTS, FAULTS, Fault, write_settings
 

@@ -13,13 +13,13 @@ from typer.testing import CliRunner
 from stereocities.site_images import simulate_site_image
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.ingest import ingest
+from stereotruth.project import pairs as command
 from stereotruth.project.check import check_project
 from stereotruth.project.example_city import SITE
 from stereotruth.project.main import app
 from stereotruth.project.pairs import Choice, list_pairs, rated_pairs, table
 from stereotruth.project.pairs_table import show_pairs
 from stereotruth.project.project import configured, names_in_pair, read_images, read_scenes
-from stereotruth.project.project import pairs as command
 from stereotruth.sensor.pair_quality import RatedPair, quality_of
 from stereotruth.sensor.site_pairs import SitePair
 
