@@ -110,13 +110,13 @@ def _before(at: Places, s: int, t: int) -> bool:
 
 @inner
 def _turns() -> NDArray[np.uint16]:
-    """Along a Hilbert curve through squares by four bits of x and of y: for each of four ways
-    through the greater square, and these bits, the number of the square and the way through it."""
+    """Along a Hilbert curve through squares by four bits of x and of y: for each of four directions
+    through the greater square, and these bits, the number of the square and the direction there."""
     out = np.empty((4, 16, 16), np.uint16)
-    for way in range(4):
+    for direction in range(4):
         for x in range(16):
             for y in range(16):
-                turned, swapped, key = way & 1, way >> 1, 0
+                turned, swapped, key = direction & 1, direction >> 1, 0
                 for bit in (3, 2, 1, 0):
                     rx, ry = (x >> bit & 1) ^ turned, (y >> bit & 1) ^ turned
                     if swapped:
@@ -124,7 +124,7 @@ def _turns() -> NDArray[np.uint16]:
                     key = key << 2 | ((3 * rx) ^ ry)
                     if ry == 0:
                         turned, swapped = turned ^ rx, 1 - swapped
-                out[way, x, y] = key << 2 | swapped << 1 | turned
+                out[direction, x, y] = key << 2 | swapped << 1 | turned
     return out
 
 
@@ -146,10 +146,10 @@ def _insertion_order(x: Ints, y: Ints, bits: int) -> Steps:
             mixed >>= np.uint64(2)
             level += 1
         px, py = x[k] >> HILBERT_BITS, y[k] >> HILBERT_BITS
-        key, way = ROUNDS - 1 - level, 0
+        key, direction = ROUNDS - 1 - level, 0
         for shift in range(bits - 4, -1, -4):
-            turn = np.int64(turns[way, px >> shift & 15, py >> shift & 15])
-            key, way = key << 8 | turn >> 2, turn & 3
+            turn = np.int64(turns[direction, px >> shift & 15, py >> shift & 15])
+            key, direction = key << 8 | turn >> 2, turn & 3
         keys[k] = key
     # sorted by DIGIT_BITS at a time, from the last ones on
     order, sorted_order = np.arange(x.size).astype(np.int32), np.empty(x.size, np.int32)

@@ -456,8 +456,11 @@ def ground_surface(
     lines = breaklines(
         vertices, triangles, planes.slopes, planes.is_facet, to_cut, scale, height_variances()
     )
-    found = np.flatnonzero(~np.isnan(lines.line[:, 3]))
-    to_cut, lines = to_cut[found], type(lines)(*(values.take(found, axis=0) for values in lines))
+    lined = np.flatnonzero(~np.isnan(lines.line[:, 3]))
+    to_cut, lines = (
+        to_cut[lined],
+        type(lines)(*(values.take(lined, axis=0) for values in lines)),
+    )
     cut = corner.take(to_cut, axis=0)
     pieces = cut_triangles(vertices, cut, lines)
     every, cut_facets, strips = with_pieces(vertices, cut, lines, pieces, scale.cell)
