@@ -2,7 +2,7 @@
 
 Between points that lie close together a rough surface is known to some tenths of a pixel. So
 
-1. its points are tops, and those that went through it (:mod:`stereotruth.surface.rough_tops`);
+1. its points are tops, and those that went through it (:mod:`stereotruth.surface.surface`);
 2. a pixel's value is linear in the triangle of tops that is nearest to the left camera;
 3. a pixel is labelled if no other triangle, facet or steep, nor a strip between known surfaces may
    be nearer to either camera, if nothing near it is much higher, if nothing higher comes close to
@@ -37,8 +37,8 @@ from ..surface.raster import (
     SeenSurface,
     right_pixels,
 )
-from ..surface.rough_tops import RoughTops
 from ..surface.scale import FACET_RESIDUAL_PX
+from ..surface.surface import RoughTops
 from .pair_window import Labels, PairWindow, WindowLabels, merged_status
 from .view_geometry import PixelScale
 

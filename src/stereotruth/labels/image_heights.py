@@ -36,9 +36,8 @@ from ..sensor.pair_geometry import GroundOfImages
 from ..sensor.rpc import SensorModel
 from ..surface.facet_values import PixelValues
 from ..surface.raster import PRISM_IN_LEFT, VISIBLE, ProjectedSurface, SeenSurface
-from ..surface.region import SQUARE_BITS, Region
 from ..surface.scale import BASE_OVER_HEIGHT, PART
-from ..surface.surface_store import Box, SurfaceStore
+from ..surface.surface_store import SQUARE_BITS, Box, Region, SurfaceStore
 from ..surface.vertices import Vertices
 from .crowns import HIGHER_PX, HIGHER_REACH, NearestTops
 from .view_geometry import PixelScale

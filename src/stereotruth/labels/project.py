@@ -122,7 +122,7 @@ class _Blocks:
         block = block[0], self.scene.pair.cols(block[1])
         window = tuple(slice(edge.start - margin, edge.stop + margin) for edge in block)
         points = sorted(_identity(store.attrs) for store in self.scene.windows.touched(*window))
-        surface = [part.sha256 for part in self.scene.surface_blocks(*window)]
+        surface = [part.checksum for part in self.scene.surface_blocks(*window)]
         return digest({"content": self.content, "points": points, "surface": surface})
 
     def make_lidar(self, name: str, block: Block) -> None:

@@ -24,9 +24,8 @@ from ..core.numerics.windows import box_max
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
 from ..lidar.point_store import PointStore
 from ..lidar.smooth_maps import LocalProjection
-from ..surface.region import SQUARE_BITS, Region
 from ..surface.scale import PART_BITS
-from ..surface.surface_store import Block, WindowSurface
+from ..surface.surface_store import SQUARE_BITS, Block, Region, WindowSurface
 from ..surface.vertices import Vertices
 from .view_geometry import Rays, ViewGeometry
 

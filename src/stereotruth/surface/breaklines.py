@@ -5,7 +5,7 @@ straight over many points, so that the points on both sides along an edge say mu
 three of one triangle where it runs: of all lines that part the low from the high points around, as
 far along the edge as there is such a line (a corner ends it), the feasible ones form a convex set
 in (offset, slope), see :mod:`.feasible_lines`. The breakline lies within the span of this set. A
-triangle is cut there (:mod:`.cut_triangles`): what lies clearly on one side belongs to that
+triangle is cut there (:mod:`.surface`): what lies clearly on one side belongs to that
 surface's plane, the strip in between may hold any height between both.
 
 All follows from the points up to BREAKLINE_REACH around a triangle, in an order of theirs that no
@@ -19,26 +19,34 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inlined, inner, kernel
+from ..core.kernels import inlined, kernel
 from .delaunay import Triangles
-from .feasible_lines import MOST_CORNERS, POLYGONS, RINGS, Band, Polygons, Sides, feasible_lines
-from .scale import BREAKLINE_REACH, PART, SurfaceScale, height_steps
-from .step_points import (
+from .feasible_lines import (
+    MOST_CORNERS,
     MOST_STEP_POINTS,
+    POLYGONS,
+    RINGS,
+    Around,
+    Band,
     Centroid,
     Nearby,
+    Polygons,
+    Sides,
     StepPoints,
+    feasible_lines,
     points_of_sides,
     points_within,
     step_points,
     sums_of_sides,
 )
+from .scale import BREAKLINE_REACH, PART, SurfaceScale, height_steps
 from .vertices import Vertices
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Bools = NDArray[np.bool_]
+Corners = tuple[int, int, int]  # of a triangle
 
 NEAR_SPACINGS = 3.0  # within which points determine heights and the direction of a step
 BAND_SPACINGS = 2.5  # and how far off the breakline points still bound it
@@ -121,10 +129,10 @@ def _height_at(planed: Planed, w: int, centre: Centroid) -> float:
     return float(planed.h[w]) + planed.slopes[w, 0] * u + planed.slopes[w, 1] * v
 
 
-@inner
+@inlined
 def _explaining_vertex(
     planed: Planed,
-    corner: Steps,
+    corner: Corners,
     one: int,
     one_h: float,
     centre: Centroid,
@@ -170,7 +178,7 @@ def _explaining_vertex(
 @inlined
 def _two_planes(
     planed: Planed,
-    corner: Steps,
+    corner: Corners,
     centre: Centroid,
     points: StepPoints,
     limits: _Limits,
@@ -212,7 +220,7 @@ def _two_planes(
 @inlined
 def _fits_corners(
     planed: Planed,
-    corner: Steps,
+    corner: Corners,
     centre: Centroid,
     planes: Floats,
     line: tuple[float, float, float, float],
@@ -242,7 +250,7 @@ def _fits_corners(
 @inlined
 def _mean_line(
     planed: Planed,
-    corner: Steps,
+    corner: Corners,
     centre: Centroid,
     normal: tuple[float, float],
     polygons: Polygons,
@@ -288,6 +296,11 @@ def _fill_breaklines(
     sides = Sides(
         np.empty(MOST_STEP_POINTS), np.empty(MOST_STEP_POINTS), np.empty(MOST_STEP_POINTS, np.bool_)
     )
+    most = 2 * MOST_STEP_POINTS
+    around = Around(
+        np.empty(most), np.empty(most), np.empty(most, np.int32), np.empty(most, np.bool_),
+        np.empty(most, np.uint8),
+    )  # fmt: skip
     polygons = Polygons(
         np.empty((POLYGONS + 1, 2, MOST_CORNERS)),
         np.empty(POLYGONS + 1, np.int32),
@@ -295,6 +308,7 @@ def _fill_breaklines(
         np.empty(2),
         np.empty(MOST_CORNERS),
         np.empty(MOST_STEP_POINTS, np.int32),
+        np.empty(MOST_STEP_POINTS),
         np.empty(RINGS + 1, np.int32),
     )
     planes, sums = np.empty((2, 3)), np.empty((2, 5))
@@ -304,14 +318,14 @@ def _fill_breaklines(
     x, y = planed.x, planed.y
     for t in range(len(corner)):
         out.line[t, 3] = np.nan
-        a, b, c = corner[t]
+        a, b, c = abc = corner[t, 0], corner[t, 1], corner[t, 2]
         area = float((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
         if area < 2.0 * SMALLEST_AREA * spacing * spacing:
             continue
         ox = float(x[b] - x[a] + x[c] - x[a]) / 3.0
         oy = float(y[b] - y[a] + y[c] - y[a]) / 3.0
         centre = Centroid(x[a], y[a], ox, oy)
-        low, top, n = _two_planes(planed, corner[t], centre, points, limits, near, planes)
+        low, top, n = _two_planes(planed, abc, centre, points, limits, near, planes)
         if low < 0 or not sums_of_sides(points, planes, near, n, spacing, residual, sums):
             continue
         nx = sums[1, 1] / sums[1, 0] - sums[0, 1] / sums[0, 0]
@@ -322,18 +336,18 @@ def _fill_breaklines(
         normal = nx / length, ny / length
         extent = 4.0 * radius[t]
         m, least_h, most_h = points_of_sides(
-            points, centre, planes, normal, reach, extent + width, spacing, residual, sides
-        )
+            points, centre, planes, normal, reach, extent + width, spacing, residual, around, sides
+        )  # fmt: skip
         s = feasible_lines(sides, m, extent, band, polygons)
-        line = _mean_line(planed, corner[t], centre, normal, polygons, s)
+        line = _mean_line(planed, abc, centre, normal, polygons, s)
         if line[3] > WIDEST_STRIP * spacing:
             continue
-        if not _fits_corners(planed, corner[t], centre, planes, line, residual):
+        if not _fits_corners(planed, abc, centre, planes, line, residual):
             continue
         for k in range(4):
             out.line[t, k] = line[k]
         for side in range(2):
-            level, gx, gy = planes[side]
+            level, gx, gy = planes[side, 0], planes[side, 1], planes[side, 2]
             level += sums[side, 3] / sums[side, 0]
             out.planes[t, 3 * side] = level - gx * ox - gy * oy
             out.planes[t, 3 * side + 1], out.planes[t, 3 * side + 2] = gx, gy

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -33,21 +33,24 @@ Places = NDArray[np.int32]
 MAX_PARTS = 1 << 19
 _SPLIT = 20  # bits; see _in_circle
 HILBERT_BITS = 6  # of a square's side in parts: two ground cells
+ROUNDS = 7  # of insertion
+DIGIT_BITS = 10  # by which keys are sorted
+DIGIT = (1 << DIGIT_BITS) - 1
 BESIDE = 3  # columns of a mesh from which on the neighbours stand
-NEAR = 1 << 14  # parts: of vertices nearer than this the test needs no split
+NEAR = 1 << 30  # square parts: of vertices that near each other the test needs no split
 
 
 # ---------------------------------------------------------------------------------- exact tests
 
 
-@inner
+@inlined
 def _turn(at: Places, a: int, b: int, c: int) -> int:
     """Twice the signed area of a triangle: positive if it runs counter-clockwise."""
     x, y = np.int64(at[a, 0]), np.int64(at[a, 1])
     return (at[b, 0] - x) * (at[c, 1] - y) - (at[b, 1] - y) * (at[c, 0] - x)
 
 
-@inner
+@inlined
 def _in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     """Whether ``d`` lies in the circumcircle of the counter-clockwise (a, b, c); never a tie."""
     x, y = np.int64(at[d, 0]), np.int64(at[d, 1])
@@ -56,10 +59,7 @@ def _in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     cx, cy = at[c, 0] - x, at[c, 1] - y
     p, q, r = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
     u, v, w = ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy
-    # All bits that any of them has, negative ones turned: all are less than 2**14 where these are
-    bits = (ax ^ (ax >> 63)) | (ay ^ (ay >> 63)) | (bx ^ (bx >> 63))
-    bits |= (by ^ (by >> 63)) | (cx ^ (cx >> 63)) | (cy ^ (cy >> 63))
-    if bits < NEAR:  # 29 bits times 29 bits, three of them
+    if u | v | w < NEAR:  # as great as p, q, r: 30 bits times 30 bits, three of them
         lifted = p * u + q * v + r * w
         if lifted != 0:
             return lifted > 0
@@ -74,7 +74,7 @@ def _in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     return _tie_in_circle(at, a, b, c, d)
 
 
-@inner
+@inlined
 def _tie_in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     """:func:`_in_circle` of cocircular vertices: the one of the highest rank is lifted most. Its
     cofactor decides, or, where the other three lie on a line, that of the next."""
@@ -100,7 +100,7 @@ def _tie_in_circle(at: Places, a: int, b: int, c: int, d: int) -> bool:
     return False
 
 
-@inner
+@inlined
 def _before(at: Places, s: int, t: int) -> bool:
     return at[s, 1] < at[t, 1] or (at[s, 1] == at[t, 1] and at[s, 0] < at[t, 0])
 
@@ -108,10 +108,32 @@ def _before(at: Places, s: int, t: int) -> bool:
 # ------------------------------------------------------------------------------------ insertion
 
 
+@inner
+def _turns() -> NDArray[np.uint16]:
+    """Along a Hilbert curve through squares by four bits of x and of y: for each of four directions
+    through the greater square, and these bits, the number of the square and the direction there."""
+    out = np.empty((4, 16, 16), np.uint16)
+    for direction in range(4):
+        for x in range(16):
+            for y in range(16):
+                turned, swapped, key = direction & 1, direction >> 1, 0
+                for bit in (3, 2, 1, 0):
+                    rx, ry = (x >> bit & 1) ^ turned, (y >> bit & 1) ^ turned
+                    if swapped:
+                        rx, ry = ry, rx
+                    key = key << 2 | ((3 * rx) ^ ry)
+                    if ry == 0:
+                        turned, swapped = turned ^ rx, 1 - swapped
+                out[direction, x, y] = key << 2 | swapped << 1 | turned
+    return out
+
+
 @kernel
-def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
+def _insertion_order(x: Ints, y: Ints, bits: int) -> Steps:
     """Order of insertion: rounds of four times the vertices each, along a Hilbert curve of squares
-    of 1 << HILBERT_BITS parts, numbered by ``bits`` along each axis."""
+    of 1 << HILBERT_BITS parts, numbered by ``bits`` along each axis, a multiple of 4."""
+    turns = _turns()
+    keys = np.empty(x.size, np.uint32)
     for k in range(x.size):
         mixed = (np.uint64(x[k]) * np.uint64(0x9E3779B97F4A7C15)) ^ (
             np.uint64(y[k]) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -120,33 +142,45 @@ def _keys(x: Ints, y: Ints, bits: int, out: Ints) -> None:
         mixed *= np.uint64(0xBF58476D1CE4E5B9)
         mixed ^= mixed >> np.uint64(32)
         level = np.int64(0)
-        while level < 6 and mixed & np.uint64(3) == np.uint64(3):
+        while level < ROUNDS - 1 and mixed & np.uint64(3) == np.uint64(3):
             mixed >>= np.uint64(2)
             level += 1
         px, py = x[k] >> HILBERT_BITS, y[k] >> HILBERT_BITS
-        key = np.int64(0)
-        side = np.int64(1) << (bits - 1)
-        while side > 0:
-            rx = np.int64(1) if px & side else np.int64(0)
-            ry = np.int64(1) if py & side else np.int64(0)
-            key = (key << 2) | ((3 * rx) ^ ry)
-            if ry == 0:
-                if rx == 1:
-                    px, py = ~px, ~py
-                px, py = py, px
-            side >>= 1
-        out[k] = ((6 - level) << 40) | key
+        key, direction = ROUNDS - 1 - level, 0
+        for shift in range(bits - 4, -1, -4):
+            turn = np.int64(turns[direction, px >> shift & 15, py >> shift & 15])
+            key, direction = key << 8 | turn >> 2, turn & 3
+        keys[k] = key
+    # sorted by DIGIT_BITS at a time, from the last ones on
+    order, sorted_order = np.arange(x.size).astype(np.int32), np.empty(x.size, np.int32)
+    for shift in range(0, 2 * bits + 3, DIGIT_BITS):
+        start = np.zeros((1 << DIGIT_BITS) + 1, np.int32)
+        for k in range(x.size):
+            start[(keys[k] >> shift & DIGIT) + 1] += 1
+        for digit in range(DIGIT):
+            start[digit + 1] += start[digit]
+        for k in range(x.size):
+            digit = keys[order[k]] >> shift & DIGIT
+            sorted_order[start[digit]] = order[k]
+            start[digit] += 1
+        order, sorted_order = sorted_order, order
+    return order
 
 
-@inner
+@inlined
+def _side(mesh: Steps, t: int, other: int) -> int:
+    """Beside which side of triangle ``t`` another lies; without branches, which the processor could
+    not predict."""
+    return np.int64(mesh[t, BESIDE + 1] == other) + 2 * np.int64(mesh[t, BESIDE + 2] == other)
+
+
+@inlined
 def _replace(mesh: Steps, t: int, old: int, new: int) -> None:
     if t >= 0:
-        for i in range(BESIDE, BESIDE + 3):
-            if mesh[t, i] == old:
-                mesh[t, i] = new
+        mesh[t, BESIDE + _side(mesh, t, old)] = new
 
 
-@inner
+@inlined
 def _set(mesh: Steps, t: int, v: tuple, n: tuple) -> None:
     mesh[t, 0], mesh[t, 1], mesh[t, 2] = v
     mesh[t, BESIDE], mesh[t, BESIDE + 1], mesh[t, BESIDE + 2] = n
@@ -201,9 +235,7 @@ def _insert_all(at: Places, mesh: Steps) -> int:
                 mesh[t, BESIDE + (edge + 2) % 3],
             )
             u = mesh[t, BESIDE + edge]
-            k = 0
-            while mesh[u, BESIDE + k] != t:
-                k += 1
+            k = _side(mesh, u, t)
             d = mesh[u, k]
             # u runs (d, b, a)
             beyond_b, beyond_a = mesh[u, BESIDE + (k + 1) % 3], mesh[u, BESIDE + (k + 2) % 3]
@@ -223,9 +255,7 @@ def _insert_all(at: Places, mesh: Steps) -> int:
             u = mesh[t, BESIDE + 2]
             if u < 0:
                 continue
-            k = 0
-            while mesh[u, BESIDE + k] != t:
-                k += 1
+            k = _side(mesh, u, t)
             q = mesh[u, k]
             a, b = mesh[t, 0], mesh[t, 1]
             if not _in_circle(at, a, b, p, q):
@@ -262,7 +292,17 @@ class Triangles(NamedTuple):
     radius: Floats
 
 
-@inner
+@kernel
+def height_ranges(h: Ints, corner: Steps) -> Ints:
+    """Least and greatest height [n, 2] of the vertices of triangles [n, 3]."""
+    out = np.empty((len(corner), 2), np.int64)
+    for t in range(len(corner)):
+        a, b, c = h[corner[t, 0]], h[corner[t, 1]], h[corner[t, 2]]
+        out[t, 0], out[t, 1] = min(a, b, c), max(a, b, c)
+    return out
+
+
+@inlined
 def _circumradius(at: Places, a: int, b: int, c: int) -> float:
     u, v = float(at[b, 0] - at[a, 0]), float(at[b, 1] - at[a, 1])
     s, t = float(at[c, 0] - at[b, 0]), float(at[c, 1] - at[b, 1])
@@ -272,7 +312,7 @@ def _circumradius(at: Places, a: int, b: int, c: int) -> float:
 
 
 @kernel
-def _tidy(at: Places, order: Ints, mesh: Steps, limit: float) -> tuple[Steps, Steps, Floats]:
+def _tidy(at: Places, order: Steps, mesh: Steps, limit: float) -> tuple[Steps, Steps, Floats]:
     """Triangles of circumradius up to ``limit`` without the square's corners, in order.
 
     ``order``: the number that each vertex gets.
@@ -340,11 +380,9 @@ def triangulate(x: Ints, y: Ints, max_radius: float) -> Triangles:
     end = int(max(x.max(initial=0), y.max(initial=0))) + spare
     if end + spare >= MAX_PARTS:
         raise ValueError(f"positions {end} parts of a cell apart, at most {MAX_PARTS} are exact")
-    keys = np.empty(n, np.int64)
-    _keys(x, y, max((end >> HILBERT_BITS).bit_length(), 1), keys)
-    order = np.argsort(keys, kind="stable")
+    order = _insertion_order(x, y, -(-(end >> HILBERT_BITS).bit_length() // 4) * 4)
     at = np.empty((n + 4, 2), np.int32)
-    at[:n, 0], at[:n, 1] = x[order], y[order]
+    at[:n, 0], at[:n, 1] = x.take(order), y.take(order)
     at[n:] = [(-spare, -spare), (end, -spare), (end, end), (-spare, end)]
     mesh = np.empty((2 * n + 2, 8), np.int32)
     count = _insert_all(at, mesh)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, kernel
 from .delaunay import Triangles
 from .scale import HEIGHT_NOISE_M, PART, PRIOR_NOISE_M, SurfaceScale, height_steps
 from .vertices import Vertices
@@ -60,7 +60,7 @@ def height_variances() -> tuple[float, float]:
     return height_steps(PRIOR_NOISE_M) ** 2, height_steps(HEIGHT_NOISE_M) ** 2
 
 
-@inner
+@inlined
 def _slopes(x: Ints, y: Ints, h: Ints, a: int, b: int, c: int) -> tuple[float, float, float]:
     """Slopes of a triangle (eq. 1 of docs/explanation/surface.md), and twice its area."""
     u, v, s, t = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
@@ -69,14 +69,14 @@ def _slopes(x: Ints, y: Ints, h: Ints, a: int, b: int, c: int) -> tuple[float, f
     return float(p * t - q * v) / area, float(q * u - p * s) / area, area
 
 
-@inner
+@inlined
 def _far_vertex(corner: Steps, t: int, i: int, u: int) -> int:
     """The vertex of triangle u, opposite vertex i of triangle t, that t has not."""
     shared = corner[t, 0] + corner[t, 1] + corner[t, 2] - corner[t, i]
     return corner[u, 0] + corner[u, 1] + corner[u, 2] - shared
 
 
-@inner
+@inlined
 def _residual(x: Ints, y: Ints, h: Ints, v: int, w: int, gx: float, gy: float) -> float:
     """Height of vertex w above the plane of slopes (gx, gy) through vertex v (eq. 2 of
     docs/explanation/surface.md)."""
@@ -90,11 +90,11 @@ def _vertex_slopes(
     """Slopes [n, 2] of the gentlest ``chosen`` triangle at each vertex (eq. 1 of
     docs/explanation/surface.md), slivers apart; NaN where none is."""
     x, y, h, corner = vertices.x, vertices.y, vertices.h_q, triangles.corner
-    out = np.full((x.size, 2), np.nan)
+    out, least = np.full((x.size, 2), np.nan), np.full(x.size, np.inf)
     for t in range(len(corner)):
         if not chosen[t]:
             continue
-        a, b, c = corner[t]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         gx, gy, area = _slopes(x, y, h, a, b, c)
         longest = 0
         for p, q in ((a, b), (b, c), (c, a)):
@@ -103,12 +103,13 @@ def _vertex_slopes(
             continue
         steep = gx * gx + gy * gy
         for v in (a, b, c):
-            old = out[v, 0] ** 2 + out[v, 1] ** 2
-            if not steep > old:  # also for NaN
-                # Equally steep ones: by their slopes, so that the order does not count.
-                if steep == old and (gx, gy) > (out[v, 0], out[v, 1]):
-                    continue
-                out[v, 0], out[v, 1] = gx, gy
+            # Equally steep ones: by their slopes, so that the order does not count.
+            if steep == least[v] and (gx, gy) > (out[v, 0], out[v, 1]):
+                continue
+            gentler = steep <= least[v]  # the processor could not predict a branch
+            out[v, 0] = gx if gentler else out[v, 0]
+            out[v, 1] = gy if gentler else out[v, 1]
+            least[v] = steep if gentler else least[v]
     return out
 
 
@@ -135,21 +136,22 @@ def _on_vertex_planes(
 
 
 @kernel
-def _incident(corner: Steps, vertices: int) -> tuple[Steps, Steps]:
-    """Triangles at each vertex: ``list[start[v] : start[v + 1]]``."""
+def _incident(corner: Steps, chosen: Bools, vertices: int) -> tuple[Steps, Steps]:
+    """The ``chosen`` triangles at each vertex: ``list[start[v] : start[v + 1]]``."""
     start = np.zeros(vertices + 1, np.int32)
     for t in range(len(corner)):
         for i in range(3):
-            start[corner[t, i] + 1] += 1
+            start[corner[t, i] + 1] += chosen[t]
     for v in range(vertices):
         start[v + 1] += start[v]
     filled = start[:-1].copy()
-    out = np.empty(3 * len(corner), np.int32)
+    out = np.empty(start[vertices], np.int32)
     for t in range(len(corner)):
-        for i in range(3):
-            v = corner[t, i]
-            out[filled[v]] = t
-            filled[v] += 1
+        if chosen[t]:
+            for i in range(3):
+                v = corner[t, i]
+                out[filled[v]] = t
+                filled[v] += 1
     return start, out
 
 
@@ -160,7 +162,7 @@ def _with_creases(
     """The triangles ``on_planes`` of their vertices, and the ``small`` ones on the plane of such a
     triangle that shares a vertex with them (eq. 2 of docs/explanation/surface.md)."""
     x, y, h = vertices.x, vertices.y, vertices.h_q
-    start, around = _incident(corner, x.size)
+    start, around = _incident(corner, on_planes, x.size)
     out = on_planes.copy()
     for t in range(len(corner)):
         if on_planes[t] or not small[t]:
@@ -169,8 +171,6 @@ def _with_creases(
             v = corner[t, i]
             for k in range(start[v], start[v + 1]):
                 f = around[k]
-                if not on_planes[f]:
-                    continue
                 gx, gy, _ = _slopes(x, y, h, corner[f, 0], corner[f, 1], corner[f, 2])
                 b, c = corner[t, (i + 1) % 3], corner[t, (i + 2) % 3]
                 if (
@@ -200,7 +200,7 @@ def _domes(
     corner, neighbour = triangles.corner, triangles.neighbour
     out = np.zeros(len(corner), np.bool_)
     for t in range(len(corner)):
-        a, b, c = corner[t]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         low, high = min(h[a], h[b], h[c]), max(h[a], h[b], h[c])
         good = small[t] and high - low <= height
         for v, w, u in ((a, b, c), (b, c, a), (c, a, b)):
@@ -274,7 +274,7 @@ def _residual_sums(
     for t in range(len(corner)):
         if not is_facet[t]:
             continue
-        a, b, c = corner[t]
+        a, b, c = corner[t, 0], corner[t, 1], corner[t, 2]
         gx, gy, area = _slopes(x, y, h, a, b, c)
         for i in range(3):
             u = neighbour[t, i]

@@ -12,6 +12,7 @@ the global lattice (:mod:`stereotruth.lidar.lattice`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -137,7 +138,7 @@ class SurfaceScale:
         steps of two radii. A breakline follows from the points up to BREAKLINE_REACH around and
         their planes (two radii more); a rough surface from six steps, and its labels from
         ``rough_halo_cells`` around. Which vertices there are follows from the squares around
-        (:mod:`.even_ground`).
+        (:func:`.vertices.even_ground`).
         """
         facet, swept = self.facet_radius, self.swept_radius
         halo = max(12 * facet, 2 * swept) + BREAKLINE_REACH * self.spacing + 2 * facet
@@ -156,6 +157,23 @@ class SurfaceScale:
         there."""
         breakline = BREAKLINE_REACH * self.spacing + 2.0 * self.facet_radius
         return max(breakline, 2.0 * self.swept_radius)
+
+
+class SquareGrid(NamedTuple):
+    """The squares of a window: ``shape`` (rows, cols); ``before`` (cols, rows): cells of the first
+    square that lie before the window's first cell."""
+
+    shape: tuple[int, int]
+    before: tuple[int, int]
+
+    @classmethod
+    def around(cls, first: tuple[int, int], shape: tuple[int, int]) -> SquareGrid:
+        """Of a window of ``shape`` (rows, cols) cells from the ``first`` cell (col, row) on."""
+        before = first[0] % SQUARE_CELLS, first[1] % SQUARE_CELLS
+        rows, cols = (
+            (size - 1 + cells) // SQUARE_CELLS + 1 for size, cells in zip(shape, before[::-1])
+        )
+        return cls((rows, cols), before)
 
 
 def ground_cell(pixel_deg: tuple[float, float]) -> tuple[int, int]:

@@ -3,53 +3,90 @@
 A folder:
 
 =================  =========================================================================
-``blocks/R_C.npz`` triangles whose first vertex lies in block (R, C) of ``side`` ground cells:
-                   records of :data:`ARRAYS`, not compressed, each array with a checksum
-``surface.json``   ``scale`` of the surface, ``side``, ``blocks``: of each that has triangles its
-                   number, the box of its vertices and the SHA-256 of its file; and a digest
+``groups/R_C.bin`` the blocks of a group, one after the other: first all columns of ``vertices``,
+                   then those of the triangles (:data:`COLUMNS`), not compressed; each kind
+                   begins at a multiple of 8 bytes
+``blocks.npy``     a row for each block that has triangles (:data:`TABLE`): its number, box and
+                   heights, its group, where it begins there, how many records it has of each
+                   kind, checksums of its vertices and of its triangles
+``surface.json``   ``scale`` of the surface, ``side`` of its blocks in ground cells, the checksum
+                   of ``blocks.npy``, the meaning of the columns; and a digest
 =================  =========================================================================
 
-Blocks lie on the global lattice. What a window of an image shows follows from the blocks whose
-boxes it sees (:meth:`SurfaceStore.blocks`), taken in their order.
+A block (R, C) has the triangles whose first vertex lies in it. Blocks lie on the global lattice.
+What a window of an image shows follows from the blocks whose boxes it sees
+(:meth:`SurfaceStore.blocks`), taken in their order.
 """
 
 from __future__ import annotations
 
-import io
-import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.lib.format import read_array_header_1_0, read_magic
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
 from ..core.products.files import read_sealed
 from ..lidar.lattice import LATTICE_DEG
-from .region import Region
-from .rough_tops import RoughTops
-from .scale import PART, SurfaceScale
-from .surface import GroundSurface
-from .vertices import Vertices
+from .delaunay import height_ranges
+from .scale import PART, PART_BITS, SurfaceScale
+from .surface import GroundSurface, RoughTops
+from .vertices import Vertices, whole_quotient
 
-FORMAT = 3
-ATTRIBUTES, BLOCKS = "surface.json", "blocks"
-CORNER = ("corner", "<i4", 3)
-ARRAYS = {  # of records
-    "vertices": np.dtype(
-        [("lon", "<i4"), ("lat", "<i4"), ("height", "<i4"),
-         ("count", "<u2"), ("day", "<u2"), ("surface_class", "u1")]
+Ints = NDArray[np.int64]
+Steps = NDArray[np.int32]
+Bools = NDArray[np.bool_]
+
+SQUARE_BITS = PART_BITS + 4  # of parts of a cell: squares of 16 cells
+
+
+@kernel
+def _touching(x: Ints, y: Ints, corner: Steps, start: int, squares: Bools) -> Bools:
+    """Which triangles' bounding boxes touch one of the ``squares``."""
+    out = np.zeros(len(corner), np.bool_)
+    for t in range(len(corner)):
+        a, b, c = start + corner[t, 0], start + corner[t, 1], start + corner[t, 2]
+        west, east = min(x[a], x[b], x[c]) >> SQUARE_BITS, max(x[a], x[b], x[c]) >> SQUARE_BITS
+        south, north = min(y[a], y[b], y[c]) >> SQUARE_BITS, max(y[a], y[b], y[c]) >> SQUARE_BITS
+        for j in range(south, north + 1):
+            for i in range(west, east + 1):
+                out[t] |= squares[j, i]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """``squares`` bool [rows, cols] of the ground, from the vertices' origin, that are wanted."""
+
+    squares: Bools
+
+    def touching(self, vertices: Vertices, corner: Steps, start: int) -> Bools:
+        """Which triangles [m, 3] lie in the region at least in part; their corners count from the
+        vertex ``start``."""
+        return _touching(vertices.x, vertices.y, corner, start, self.squares)
+
+
+FORMAT = 4
+ATTRIBUTES, BLOCKS, GROUPS = "surface.json", "blocks.npy", "groups"
+CORNER = ("corner", "<i4", (3,))
+COLUMNS = {  # by falling size of their items, so that each begins where these may
+    "vertices": (
+        ("lon", "<i4", ()), ("lat", "<i4", ()), ("height", "<i4", ()),
+        ("count", "<u2", ()), ("day", "<u2", ()), ("surface_class", "u1", ()),
     ),
-    "facets": np.dtype([CORNER, ("variance", "<f4"), ("bulge", "<f4")]),
-    "whole": np.dtype([CORNER]),
-    "strips": np.dtype([CORNER, ("height_range", "<i4", 2)]),
-    "tops": np.dtype([CORNER, ("residual", "<f4"), ("is_gentle", "?")]),
+    "facets": (CORNER, ("variance", "<f4", ()), ("bulge", "<f4", ())),
+    "whole": (CORNER,),
+    "strips": (CORNER, ("height_range", "<i4", (2,))),
+    "tops": (CORNER, ("residual", "<f4", ()), ("is_gentle", "?", ())),
 }  # fmt: skip
-TRIANGLES = "facets", "whole", "strips", "tops"  # the arrays whose records have corners
+VERTICES, TRIANGLES = ("vertices",), ("facets", "whole", "strips", "tops")
 CONTENTS = {
     "vertices": "lon, lat from the block's south-west corner, 1e-9 degree; height above the WGS 84 "
     "ellipsoid, 1e-4 m; count of points that it is the mean of, 65535 stands for more, too; day "
@@ -62,78 +99,162 @@ CONTENTS = {
     "tops": "triangles of rough surfaces' tops; corner: vertices; residual: rms of the tops to the "
     "planes beside, 1e-4 m, NaN for none; is_gentle: neither steep nor alone",
 }
+TABLE = np.dtype(
+    [("number", "<i8", 2), ("box", "<i8", 4), ("heights", "<i8", 2), ("group", "<i8", 2),
+     ("begin", "<i8"), ("sizes", "<i8", len(COLUMNS)), ("crc32", "<u4", 2)]
+)  # fmt: skip
 Box = tuple[float, float, float, float]
+Columns = dict[str, NDArray]  # of one kind, by their names
 
 
 class Block(NamedTuple):
     """A block that has triangles: number (row, col), box of its vertices (west, south, east, north,
-    lattice steps), heights of these (lowest, highest, steps), SHA-256 of its file."""
+    lattice steps), heights of these (lowest, highest, steps), checksum of its bytes."""
 
     row: int
     col: int
     box: tuple[int, int, int, int]
     heights: tuple[int, int]
-    sha256: str
-
-    @property
-    def name(self) -> str:
-        """Of its file, without the suffix."""
-        return f"{self.row}_{self.col}"
+    checksum: str
 
 
-def write_block(path: Path, surface: GroundSurface, corner: tuple[int, int]) -> dict[str, Any]:
-    """Write the triangles of a block whose south-west ``corner`` is at (lon, lat), lattice steps;
-    its ``box`` and ``heights``."""
-    whole = surface.undecided[: surface.whole]
-    strip = surface.undecided[surface.strips]
-    triangles = [surface.facet, whole, strip, surface.tops.corner]
-    used = np.zeros(surface.vertices.x.size, np.bool_)
-    for corners in triangles:
-        used[corners.reshape(-1)] = True
-    taken = np.flatnonzero(used)
-    number = np.empty(used.size, np.int32)  # of those that are used, which are few of a group's
-    number[taken] = np.arange(taken.size, dtype=np.int32)
-    facet, whole, strip, top = (number[corners] for corners in triangles)
-    vertices = surface.vertices.taken(taken)
-    values = {
-        "vertices": {
-            "lon": vertices.lon_q - corner[0],
-            "lat": vertices.lat_q - corner[1],
-            "height": vertices.h_q,
-            "count": np.minimum(vertices.count, 65535),
-            "day": vertices.day,
-            "surface_class": vertices.surface_class,
-        },
-        "facets": {"corner": facet, "variance": surface.variance, "bulge": surface.bulge},
-        "whole": {"corner": whole},
-        "strips": {"corner": strip, "height_range": surface.height_range[surface.strips]},
-        "tops": {
-            "corner": top,
-            "residual": surface.tops.residual,
-            "is_gentle": surface.tops.is_gentle,
-        },
-    }
-    np.savez(path, **{name: _records(kind, values[name]) for name, kind in ARRAYS.items()})
-    lon, lat, h = vertices.lon_q, vertices.lat_q, vertices.h_q
-    box = [int(value) for value in (lon.min(), lat.min(), lon.max(), lat.max())]
-    return {"box": box, "heights": [int(h.min()), int(h.max())]}
-
-
-def _records(kind: np.dtype, values: Mapping[str, NDArray]) -> NDArray[np.void]:
-    """Records [n] of a ``kind`` with the ``values`` [n] of its fields."""
-    out = np.empty(len(next(iter(values.values()))), kind)
-    for name, of_field in values.items():
-        out[name] = of_field
+def _columns(kinds: Sequence[str], sizes: Sequence[int], data: NDArray[np.uint8]) -> list[Columns]:
+    """The columns of some ``kinds``, of so many records each, as views of ``data``."""
+    out, begin = [], 0
+    for kind, size in zip(kinds, sizes):
+        columns = {}
+        for name, dtype, shape in COLUMNS[kind]:
+            end = begin + size * np.dtype(dtype).itemsize * int(np.prod(shape))
+            columns[name] = data[begin:end].view(dtype).reshape(size, *shape)
+            begin = end
+        out.append(columns)
+        begin += -begin % 8
     return out
 
 
-def _array(file: bytes) -> NDArray[np.void]:
-    """The records in an array's ``file``, as a view: NumPy's own reader would copy them."""
-    stream = io.BytesIO(file)
-    if read_magic(stream) != (1, 0):
-        raise ValueError("another version of NumPy's format")
-    shape, _, kind = read_array_header_1_0(stream)
-    return np.frombuffer(file, kind, offset=stream.tell()).reshape(shape)
+def _bytes(kinds: Sequence[str], sizes: Sequence[int]) -> int:
+    """That the columns of some ``kinds`` take, of so many records each."""
+    records = [
+        sum(np.dtype((dtype, shape)).itemsize for _, dtype, shape in COLUMNS[k]) for k in kinds
+    ]
+    return sum(size * record + -(size * record) % 8 for size, record in zip(sizes, records))
+
+
+# -------------------------------------------------------------------------------------- writing
+
+
+@kernel
+def _number_used(corner: Steps, number: Steps, whole: int) -> Steps:
+    """The vertices of triangles ``corner`` [m, 3] in their order; ``corner`` gets their numbers in
+    it.
+
+    ``number``: one for each vertex there is, all -1 before and after. Of those from ``whole`` on,
+    which cut triangles have, each is that of one triangle.
+    """
+    low, high, low_cut, high_cut = whole, 0, number.size, whole
+    used = 0
+    for t in range(len(corner)):
+        for i in range(3):
+            v = corner[t, i]
+            used += number[v] < 0
+            number[v] = 0
+            if v < whole:
+                low, high = min(low, v), max(high, v + 1)
+            else:
+                low_cut, high_cut = min(low_cut, v), max(high_cut, v + 1)
+    out = np.empty(used, np.int32)
+    n = 0
+    for first, end in ((low, high), (low_cut, high_cut)):
+        for v in range(first, end):
+            if number[v] == 0:
+                out[n] = v
+                n += 1
+    for n in range(out.size):
+        number[out[n]] = n
+    for t in range(len(corner)):
+        for i in range(3):
+            corner[t, i] = number[corner[t, i]]
+    for v in out:
+        number[v] = -1
+    return out
+
+
+@kernel
+def _fill_vertices(
+    vertices: Vertices,
+    taken: Steps,
+    corner: tuple[int, int],
+    lon: Steps,
+    lat: Steps,
+    height: Steps,
+    count: NDArray[np.uint16],
+    day: NDArray[np.uint16],
+    surface_class: NDArray[np.uint8],
+) -> tuple[Ints, Ints]:
+    """The ``taken`` vertices from a block's south-west ``corner`` (lon, lat) on; least and greatest
+    (lon, lat, height) of them."""
+    low, high = np.full(3, np.iinfo(np.int64).max), np.full(3, np.iinfo(np.int64).min)
+    for n in range(taken.size):
+        v = taken[n]
+        at = vertices.lon_q[v], vertices.lat_q[v], vertices.h_q[v]
+        for axis in range(3):
+            low[axis], high[axis] = min(low[axis], at[axis]), max(high[axis], at[axis])
+        lon[n], lat[n], height[n] = at[0] - corner[0], at[1] - corner[1], at[2]
+        count[n], day[n] = min(vertices.count[v], 65535), vertices.day[v]
+        surface_class[n] = vertices.surface_class[v]
+    return low, high
+
+
+class GroupWriter:
+    """Writes the blocks of a ``group`` (row, col of the first one) to an open file; ``rows``: of
+    each one, as in :data:`TABLE`.
+
+    All blocks have triangles of the vertices of one surface, of which the first ``whole`` are
+    those of uncut triangles.
+    """
+
+    def __init__(self, stream: BinaryIO, group: tuple[int, int], vertices: int, whole: int) -> None:
+        self.stream, self.group, self.whole = stream, group, whole
+        self.number = np.full(vertices, -1, np.int32)
+        self.rows: list[list] = []
+        self.begin = 0
+
+    def write(
+        self, number: tuple[int, int], surface: GroundSurface, corner: tuple[int, int]
+    ) -> None:
+        """The triangles of block ``number``, one at least, whose south-west ``corner`` lies at
+        (lon, lat), lattice steps."""
+        undecided, tops, strips = surface.undecided, surface.tops, surface.strips
+        corners = [surface.facet, undecided[: surface.whole], undecided[strips], tops.corner]
+        every = np.concatenate(corners)
+        taken = _number_used(every, self.number, self.whole)
+        sizes = [taken.size, *map(len, corners)]
+        middle, end = _bytes(VERTICES, sizes), _bytes(tuple(COLUMNS), sizes)
+        data = np.zeros(end, np.uint8)
+        (into,) = _columns(VERTICES, sizes, data)
+        low, high = _fill_vertices(surface.vertices, taken, corner, *into.values())
+        facets, whole, strip, top = _columns(TRIANGLES, sizes[1:], data[middle:])
+        ends = np.cumsum(sizes[1:-1])
+        for columns, own in zip((facets, whole, strip, top), np.split(every, ends)):
+            columns["corner"][:] = own
+        facets["variance"][:], facets["bulge"][:] = surface.variance, surface.bulge
+        strip["height_range"][:] = surface.height_range[strips]
+        top["residual"][:], top["is_gentle"][:] = tops.residual, tops.is_gentle
+        self.stream.write(data)
+        crc32 = [zlib.crc32(part) for part in (data[:middle], data[middle:])]
+        box = [*low[:2].tolist(), *high[:2].tolist()]
+        heights = [int(low[2]), int(high[2])]
+        self.rows.append([[*number], box, heights, [*self.group], self.begin, sizes, crc32])
+        self.begin += end
+
+
+def table_of(rows: Sequence[Sequence]) -> NDArray[np.void]:
+    """The rows of all blocks of a store, by their number."""
+    table = np.array([tuple(row) for row in rows], TABLE)
+    return table[np.lexsort(table["number"].T[::-1])]
+
+
+# -------------------------------------------------------------------------------------- reading
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,55 +269,71 @@ class WindowSurface:
 
     def surface(self, region: Region) -> GroundSurface:
         """The triangles that touch a ``region``, with all vertices."""
-        parts: dict[str, list[NDArray[np.void]]] = {name: [] for name in TRIANGLES}
+        parts: dict[str, list[Columns]] = {name: [] for name in TRIANGLES}
         start = 0
         for block in self.blocks:
-            for name, triangles in self.store.arrays(block, TRIANGLES).items():
-                touching = region.touching(self.vertices, triangles["corner"], start)
-                taken = triangles.take(np.flatnonzero(touching))  # a fourth of a mask's time
+            for name, columns in self.store.triangles(block).items():
+                touching = region.touching(self.vertices, columns["corner"], start)
+                chosen = np.flatnonzero(touching)  # a fourth of a mask's time
+                taken = {field: values.take(chosen, axis=0) for field, values in columns.items()}
                 taken["corner"] += np.int32(start)
                 parts[name].append(taken)
-            start += self.store.sizes[block.name]
-        return _surface(self.vertices, {name: np.concatenate(part) for name, part in parts.items()})
+            start += self.store.vertex_count(block)
+        every = {
+            name: {field: np.concatenate([one[field] for one in part]) for field in part[0]}
+            for name, part in parts.items()
+        }
+        return _surface(self.vertices, every)
+
+
+def _surface(vertices: Vertices, triangles: Mapping[str, Columns]) -> GroundSurface:
+    """Of columns by the names of COLUMNS."""
+    facets, whole, strips, tops = (triangles[name] for name in TRIANGLES)
+    top_range = height_ranges(vertices.h_q, tops["corner"])
+    heights = height_ranges(vertices.h_q, whole["corner"]), strips["height_range"].astype(np.int64)
+    undecided = np.concatenate([whole["corner"], strips["corner"]])
+    return GroundSurface(
+        vertices=vertices,
+        facet=facets["corner"],
+        variance=facets["variance"],
+        bulge=facets["bulge"],
+        undecided=undecided,
+        height_range=np.concatenate(heights),
+        whole=len(whole["corner"]),
+        tops=RoughTops(
+            tops["corner"],
+            tops["residual"].astype(np.float64),
+            top_range[:, 1] - top_range[:, 0],
+            tops["is_gentle"],
+        ),
+        facet_origin=facets["corner"][:, 0],
+        undecided_origin=undecided[:, 0],
+    )
 
 
 @kernel
-def _height_range(h: NDArray[np.int64], corner: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Least and greatest height [n, 2] of the vertices of triangles [n, 3]."""
-    out = np.empty((len(corner), 2), np.int64)
-    for t in range(len(corner)):
-        a, b, c = h[corner[t, 0]], h[corner[t, 1]], h[corner[t, 2]]
-        out[t, 0], out[t, 1] = min(a, b, c), max(a, b, c)
-    return out
-
-
-def _surface(vertices: Vertices, triangles: Mapping[str, NDArray[np.void]]) -> GroundSurface:
-    """Of records by the names of ARRAYS."""
-
-    def field(name: str, value: str) -> NDArray:
-        return np.ascontiguousarray(triangles[name][value])
-
-    facet, whole, strip, top = (field(name, "corner") for name in TRIANGLES)
-    top_range, residual = _height_range(vertices.h_q, top), field("tops", "residual")
-    heights = _height_range(vertices.h_q, whole), field("strips", "height_range").astype(np.int64)
-    undecided = np.concatenate([whole, strip])
-    return GroundSurface(
-        vertices=vertices,
-        facet=facet,
-        variance=field("facets", "variance"),
-        bulge=field("facets", "bulge"),
-        undecided=undecided,
-        height_range=np.concatenate(heights),
-        whole=len(whole),
-        tops=RoughTops(
-            top,
-            residual.astype(np.float64),
-            top_range[:, 1] - top_range[:, 0],
-            field("tops", "is_gentle"),
-        ),
-        facet_origin=facet[:, 0],
-        undecided_origin=undecided[:, 0],
-    )
+def _fill_window(
+    lon: Steps,
+    lat: Steps,
+    height: Steps,
+    count: NDArray[np.uint16],
+    corner: tuple[int, int],
+    first: tuple[int, int],
+    cell: tuple[int, int],
+    start: int,
+    out: Vertices,
+) -> None:
+    """Positions and counts of a block's vertices, which lie from its ``corner`` (lon, lat) on, to
+    ``out`` from ``start`` on; x and y count from the ``first`` cell."""
+    west, south = first[0] * cell[0], first[1] * cell[1]
+    wide, tall = 1.0 / cell[0], 1.0 / cell[1]
+    for n in range(lon.size):
+        k = start + n
+        east, north = lon[n] + corner[0], lat[n] + corner[1]
+        out.lon_q[k], out.lat_q[k], out.h_q[k] = east, north, height[n]
+        out.x[k] = whole_quotient((east - west) * PART, wide)
+        out.y[k] = whole_quotient((north - south) * PART, tall)
+        out.count[k] = count[n]
 
 
 class SurfaceStore:
@@ -219,63 +356,95 @@ class SurfaceStore:
         scale = dict(self.attrs["scale"])
         self.scale = SurfaceScale(**scale | {"cell": tuple(scale["cell"])})
         self.side = int(self.attrs["side"])
-        self.every = tuple(
-            Block(*number, tuple(box), tuple(heights), sha256)
-            for *number, box, heights, sha256 in self.attrs["blocks"]
-        )
-        self.sizes: dict[str, int] = {}
+        try:
+            table = (self.path / BLOCKS).read_bytes()
+        except OSError as error:
+            raise self._damaged(BLOCKS) from error
+        if zlib.crc32(table) != self.attrs["blocks_crc32"]:
+            raise self._damaged(BLOCKS)
+        self._table = np.load(BytesIO(table))
+        self._row = {tuple(number): k for k, number in enumerate(self._table["number"].tolist())}
 
     @property
     def points_per_m2(self) -> float:
         """Of the points that it is made of, over the ground that they cover."""
         return self.attrs["points_per_m2"]
 
+    @cached_property
+    def every(self) -> tuple[Block, ...]:
+        """All blocks, by their number."""
+        return self._blocks(self._table)
+
+    def _blocks(self, table: NDArray[np.void]) -> tuple[Block, ...]:
+        names = "number", "box", "heights", "crc32"
+        return tuple(
+            Block(*number, tuple(box), tuple(heights), "{:08x}{:08x}".format(*crc32))
+            for number, box, heights, crc32 in zip(*(table[name].tolist() for name in names))
+        )
+
     def blocks(self, box: Box) -> tuple[Block, ...]:
         """The blocks that may have triangles in a box (west, south, east, north, degrees)."""
         west, south, east, north = (edge / LATTICE_DEG for edge in box)
-        return tuple(
-            block
-            for block in self.every
-            if block.box[0] <= east
-            and block.box[2] >= west
-            and block.box[1] <= north
-            and block.box[3] >= south
+        own = self._table["box"]
+        inside = (own[:, 0] <= east) & (own[:, 2] >= west)
+        inside &= (own[:, 1] <= north) & (own[:, 3] >= south)
+        return self._blocks(self._table[inside])
+
+    def _damaged(self, name: str) -> InputError:
+        return InputError(
+            "damaged: it is not what was written",
+            file=self.path / name,
+            remedy=f"delete {self.path} and run the workflow again",
         )
 
-    def arrays(self, block: Block, names: Sequence[str]) -> dict[str, NDArray[np.void]]:
-        """Records of a block by the names of their arrays. Raises InputError if they are not what
-        was written."""
-        file = self.path / BLOCKS / f"{block.name}.npz"
-        try:
-            with zipfile.ZipFile(file) as archive:
-                return {name: _array(archive.read(f"{name}.npy")) for name in names}
-        except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
-            raise InputError(
-                "damaged: it is not what was written",
-                file=file,
-                remedy=f"delete {self.path} and run the workflow again",
-            ) from error
+    def _of(self, block: Block) -> NDArray[np.void]:
+        return self._table[self._row[block.row, block.col]]
 
-    def positions(self, block: Block, vertices: NDArray[np.void]) -> tuple[NDArray[np.int64], ...]:
-        """Longitude, latitude and height (lattice steps) of a block's vertices."""
-        col, row = (number * self.side for number in (block.col, block.row))
-        lon = vertices["lon"] + np.int64(col * self.scale.cell[0])
-        lat = vertices["lat"] + np.int64(row * self.scale.cell[1])
-        return lon, lat, vertices["height"].astype(np.int64)
+    def vertex_count(self, block: Block) -> int:
+        """How many vertices a block has."""
+        return int(self._of(block)["sizes"][0])
+
+    def _read(self, block: Block, kinds: Sequence[str]) -> list[Columns]:
+        """Columns of the vertices or of the triangles of a block. Raises InputError if they are not
+        what was written."""
+        row = self._of(block)
+        sizes, begin = row["sizes"].tolist(), int(row["begin"])
+        if kinds == TRIANGLES:
+            begin, sizes = begin + _bytes(VERTICES, sizes), sizes[1:]
+        data = np.empty(_bytes(kinds, sizes), np.uint8)
+        name = "{}/{}_{}.bin".format(GROUPS, *row["group"])
+        try:
+            with (self.path / name).open("rb", buffering=0) as stream:
+                stream.seek(begin)
+                stream.readinto(data)
+        except OSError as error:
+            raise self._damaged(name) from error
+        if zlib.crc32(data) != row["crc32"][int(kinds == TRIANGLES)]:
+            raise self._damaged(name)
+        return _columns(kinds, sizes, data)
+
+    def vertices(self, block: Block) -> Columns:
+        """Columns of a block's vertices."""
+        return self._read(block, VERTICES)[0]
+
+    def triangles(self, block: Block) -> dict[str, Columns]:
+        """Columns of a block's triangles, by their kind."""
+        return dict(zip(TRIANGLES, self._read(block, TRIANGLES)))
 
     def window(self, blocks: Sequence[Block]) -> WindowSurface:
         """Of some blocks, one at least."""
         cell = self.scale.cell
         corners = np.array([block.box[:2] for block in blocks]).min(axis=0)
         first = tuple(int(q) // side for q, side in zip(corners, cell))
-        parts = []
+        size = sum(map(self.vertex_count, blocks))
+        whole = Vertices.empty(size)
+        start = 0
         for block in blocks:
-            a = self.arrays(block, ["vertices"])["vertices"]
-            lon, lat, h = self.positions(block, a)
-            x = (lon - first[0] * cell[0]) * PART // cell[0]
-            y = (lat - first[1] * cell[1]) * PART // cell[1]
-            count = a["count"].astype(np.int32)
-            parts.append(Vertices(lon, lat, h, x, y, a["surface_class"], count, a["day"]))
-            self.sizes[block.name] = lon.size
-        vertices = Vertices(*(np.concatenate(values) for values in zip(*parts)))
-        return WindowSurface(self, tuple(blocks), vertices, first)
+            own = self.vertices(block)
+            corner = tuple(k * self.side * step for k, step in zip((block.col, block.row), cell))
+            end = start + len(own["lon"])
+            whole.surface_class[start:end], whole.day[start:end] = own["surface_class"], own["day"]
+            values = own["lon"], own["lat"], own["height"], own["count"]
+            _fill_window(*values, corner, first, cell, start, whole)
+            start = end
+        return WindowSurface(self, tuple(blocks), whole, first)

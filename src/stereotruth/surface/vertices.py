@@ -1,7 +1,7 @@
 """The points of a window as vertices over the ground, at integer positions on a lattice.
 
 - a ground cell (half a pixel) has one vertex at most: the mean of its top surface; a square of even
-  ground has one (:mod:`.even_ground`). This bounds memory at any density, averages noise where
+  ground has one (:func:`even_ground`). This bounds memory at any density, averages noise where
   points are dense, and no two vertices coincide;
 - plan positions are integers (``PART`` parts of a cell) counted on the global lattice.
 """
@@ -14,12 +14,211 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
-from .even_ground import CellVertices, EvenGround, SquareGrid, even_ground
-from .scale import PART_BITS, SQUARE_CELLS, SurfaceScale, height_steps
+from ..core.kernels import inlined, inner, kernel
+from .scale import PART, PART_BITS, SQUARE_CELLS, SquareGrid, SurfaceScale, height_steps
 
+Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
+
+FEWEST_VERTICES = 3  # of an even square
+FEWEST_AROUND = 36  # of the nine squares: a quarter of their cells
+_SIDE = SQUARE_CELLS * PART
+
+
+class CellVertices(NamedTuple):
+    """Vertices [n], one for each cell with points: plan position (parts of a cell), height (lattice
+    steps), ASPRS class, number of the square."""
+
+    x: Steps
+    y: Steps
+    h: Steps
+    surface_class: NDArray[np.uint8]
+    square: Steps
+
+
+class EvenGround(NamedTuple):
+    """Squares [rows * cols]: which are even, the height in their middle (lattice steps), and
+    ``one`` vertex of each."""
+
+    is_even: NDArray[np.bool_]
+    height: Steps
+    one: Steps
+
+
+class _InSquares(NamedTuple):
+    """Vertices in the order of their squares, those of square s from ``start[s]`` to ``start[s +
+    1]``.
+
+    ``position`` [n, 3]: x, y from the middle of their square, height. ``surface_class``
+    [squares]: class of all vertices of a square, -1 if they differ.
+    """
+
+    start: Steps
+    order: Steps
+    position: Steps
+    surface_class: Steps
+
+
+@inner
+def _by_square(square: Steps, start: Steps) -> Steps:
+    """Vertices in the order of their squares; ``start`` [squares + 1] gets where each begins."""
+    start[:] = 0
+    for k in square:
+        start[k + 1] += 1
+    for k in range(start.size - 1):
+        start[k + 1] += start[k]
+    filled = start[:-1].copy()
+    out = np.empty(square.size, np.int32)
+    for k in range(square.size):
+        out[filled[square[k]]] = k
+        filled[square[k]] += 1
+    return out
+
+
+@inlined
+def _enough(start: Steps, s: int, cols: int) -> bool:
+    """Whether a square and the eight around it hold enough vertices."""
+    if start[s + 1] - start[s] < FEWEST_VERTICES:
+        return False
+    around = 0
+    for first in (s - cols - 1, s - 1, s + cols - 1):
+        for q in range(first, first + 3):
+            if start[q + 1] == start[q]:
+                return False
+        around += start[first + 3] - start[first]
+    return around >= FEWEST_AROUND
+
+
+@inlined
+def _moments(position: Steps, start: Steps, first: int, out: Ints) -> None:
+    """Of a row of squares from square ``first`` on: sums over the vertices of each to ``out``.
+
+    ``position`` [n, 3] of vertices, see :class:`_InSquares`; heights count from that of the
+    square's first vertex. ``out`` [cols, 8]: sums of x, y, h, xx, xy, yy, xh, yh.
+    """
+    for i in range(out.shape[0]):
+        begin, end = start[first + i], start[first + i + 1]
+        su = sv = sw = suu = suv = svv = suw = svw = 0
+        for at in range(begin, end):
+            u, v = np.int64(position[at, 0]), np.int64(position[at, 1])
+            w = np.int64(position[at, 2]) - np.int64(position[begin, 2])
+            su, sv, sw = su + u, sv + v, sw + w
+            suu, suv, svv = suu + u * u, suv + u * v, svv + v * v
+            suw, svw = suw + u * w, svw + v * w
+        row = out[i]
+        row[0], row[1], row[2], row[3] = su, sv, sw, suu
+        row[4], row[5], row[6], row[7] = suv, svv, suw, svw
+
+
+@inlined
+def _plane(
+    squares: _InSquares, moments: Ints, s: int, row: int, cols: int, tolerance: float
+) -> tuple[bool, float, float]:
+    """Whether the vertices of the nine squares around square ``s`` lie on one plane, and its slopes
+    (eq. 1 of docs/explanation/surface.md, for all vertices of nine squares).
+
+    ``moments`` [3, cols, 8]: :func:`_moments` of the rows of squares, by their number modulo 3.
+    """
+    position, start = squares.position, squares.start
+    i, side = s - row * cols, _SIDE
+    base = np.int64(position[start[s], 2])
+    n = su = sv = sw = suu = suv = svv = suw = svw = 0
+    for down in range(-1, 2):
+        v = down * side
+        for across in range(-1, 2):
+            u = across * side
+            q = s + down * cols + across
+            number = np.int64(start[q + 1] - start[q])
+            w = np.int64(position[start[q], 2]) - base
+            m = moments[(row + down) % 3, i + across]
+            n += number
+            su, sv, sw = su + m[0] + number * u, sv + m[1] + number * v, sw + m[2] + number * w
+            suu += m[3] + u * (2 * m[0] + number * u)
+            suv += m[4] + u * m[1] + v * (m[0] + number * u)
+            svv += m[5] + v * (2 * m[1] + number * v)
+            suw += m[6] + u * m[2] + w * (m[0] + number * u)
+            svw += m[7] + v * m[2] + w * (m[1] + number * v)
+    cuu, cuv, cvv = float(n * suu - su * su), float(n * suv - su * sv), float(n * svv - sv * sv)
+    cuw, cvw = float(n * suw - su * sw), float(n * svw - sv * sw)
+    area = cuu * cvv - cuv * cuv
+    gx, gy = (cuw * cvv - cvw * cuv) / area, (cvw * cuu - cuw * cuv) / area
+    level = (float(sw) - gx * float(su) - gy * float(sv)) / float(n)
+    for down in range(-1, 2):
+        for across in range(-1, 2):
+            q = s + down * cols + across
+            for at in range(start[q], start[q + 1]):
+                u, v = position[at, 0] + across * side, position[at, 1] + down * side
+                w = np.int64(position[at, 2]) - base
+                above = float(w) - gx * float(u) - gy * float(v)
+                if not abs(above - level) <= tolerance:
+                    return False, 0.0, 0.0
+    return True, gx, gy
+
+
+@inner
+def _in_squares(cells: CellVertices, grid: SquareGrid) -> _InSquares:
+    """The vertices by their squares."""
+    x, y, h, classes = cells.x, cells.y, cells.h, cells.surface_class
+    rows, cols = grid.shape
+    start = np.empty(rows * cols + 1, np.int32)
+    order = _by_square(cells.square, start)
+    position, common = np.empty((order.size, 3), np.int32), np.empty(rows * cols, np.int32)
+    west, south = -grid.before[0] * PART, -grid.before[1] * PART
+    for s in range(rows * cols):
+        j, i = divmod(s, cols)
+        middle_x, middle_y = west + i * _SIDE + _SIDE // 2, south + j * _SIDE + _SIDE // 2
+        common[s] = classes[order[start[s]]] if start[s + 1] > start[s] else -1
+        for at in range(start[s], start[s + 1]):
+            k = order[at]
+            position[at, 0], position[at, 1] = x[k] - middle_x, y[k] - middle_y
+            position[at, 2] = h[k]
+            if classes[k] != common[s]:
+                common[s] = -1
+    return _InSquares(start, order, position, common)
+
+
+@kernel
+def even_ground(cells: CellVertices, grid: SquareGrid, tolerance: float) -> EvenGround:
+    """Which squares are even: residuals to one plane (eq. 1 and 2 of docs/explanation/surface.md)
+    of ``tolerance`` (lattice steps) at most.
+
+    Points denser than pixels add nothing on even ground to what one vertex in four pixels says. A
+    square of SQUARE_CELLS by SQUARE_CELLS cells becomes one vertex in its middle, at the mean
+    height of its points there, if all vertices of the nine squares around it lie on one plane and
+    are of one class. Squares lie on the global lattice and sums are of integers, so that the
+    vertices depend neither on the window nor on the order of the points. Squares at the border of
+    the window are not even: what lies beyond is unknown.
+    """
+    rows, cols = grid.shape
+    squares = _in_squares(cells, grid)
+    start, order, position = squares.start, squares.order, squares.position
+    common = squares.surface_class
+    is_even = np.zeros(rows * cols, np.bool_)
+    height, one = np.zeros(rows * cols, np.int32), np.zeros(rows * cols, np.int32)
+    moments = np.empty((3, cols, 8), np.int64)
+    for j in range(rows):
+        _moments(position, start, j * cols, moments[j % 3])
+        # with this row, those around the one before are complete
+        for i in range(1, cols - 1 if j > 1 else 1):
+            s = (j - 1) * cols + i
+            same = common[s] >= 0
+            for q in (s - cols, s, s + cols):
+                same &= common[q - 1] == common[s]
+                same &= (common[q] == common[s]) & (common[q + 1] == common[s])
+            if not same or not _enough(start, s, cols):
+                continue
+            is_even[s], gx, gy = _plane(squares, moments, s, j - 1, cols, tolerance)
+            if is_even[s]:
+                base, above = np.int64(position[start[s], 2]), 0.0
+                for at in range(start[s], start[s + 1]):
+                    u, v = float(position[at, 0]), float(position[at, 1])
+                    above += float(position[at, 2] - base) - gx * u - gy * v
+                height[s] = base + np.int64(np.rint(above / float(start[s + 1] - start[s])))
+                one[s] = order[start[s]]
+    return EvenGround(is_even, height, one)
+
+
 Bytes = NDArray[np.uint8]
 Days = NDArray[np.uint16]
 
@@ -44,9 +243,17 @@ class Vertices(NamedTuple):
     count: Steps
     day: Days
 
-    def taken(self, chosen: NDArray) -> Vertices:
-        """The vertices of an index or a mask."""
-        return Vertices(*(values[chosen] for values in self))
+    @classmethod
+    def empty(cls, size: int) -> Vertices:
+        """Room for so many."""
+        places = (np.empty(size, np.int64) for _ in range(5))
+        return cls(
+            *places, np.empty(size, np.uint8), np.empty(size, np.int32), np.empty(size, np.uint16)
+        )
+
+    def taken(self, index: NDArray[np.integer]) -> Vertices:
+        """The vertices of an index."""
+        return Vertices(*(values.take(index) for values in self))
 
 
 class _Points(NamedTuple):
@@ -72,7 +279,7 @@ class _CellTops(NamedTuple):
 
 
 @inner
-def _whole(number: int, inverse: float) -> int:
+def whole_quotient(number: int, inverse: float) -> int:
     """``number`` // d, ``inverse`` = 1 / d; a division takes ten times as long.
 
     Exact from 0 to 2**50: there all roundings together are less than half a step.
@@ -100,7 +307,7 @@ def _raise_tops(points: _Points, tops: _CellTops, index: Steps, position: Steps)
         if returns[k] > 1:
             continue
         east, north = lon_q[k] - west, lat_q[k] - south
-        i, j = _whole(east, wide), _whole(north, tall)
+        i, j = whole_quotient(east, wide), whole_quotient(north, tall)
         index[n] = j * cols + i
         position[n, 0] = east - i * cell[0]
         position[n, 1] = north - j * cell[1]
@@ -164,8 +371,8 @@ def _means(
             if n > 1:
                 sums[k, 1], sums[k, 2] = sums[k, 1] // n, sums[k, 2] // n
                 h[k] = (n * np.int64(top[j, i]) - sums[k, 3]) // n
-            x[k] = (i << PART_BITS) + _whole(sums[k, 1] << PART_BITS, wide)
-            y[k] = (j << PART_BITS) + _whole(sums[k, 2] << PART_BITS, tall)
+            x[k] = (i << PART_BITS) + whole_quotient(sums[k, 1] << PART_BITS, wide)
+            y[k] = (j << PART_BITS) + whole_quotient(sums[k, 2] << PART_BITS, tall)
             classes[k] = top_class[j, i]
             row, col = (j + before[1]) // SQUARE_CELLS, (i + before[0]) // SQUARE_CELLS
             square[k] = row * grid.shape[1] + col
@@ -280,11 +487,6 @@ class VertexBuilder:
         points = np.zeros(even.is_even.size, np.int32)
         np.add.at(points, cells.square, sums[:, 0])
         size = n - int(even.is_even[cells.square].sum()) + int(even.is_even.sum())
-        out = Vertices(
-            *(np.empty(size, np.int64) for _ in range(5)),
-            np.empty(size, np.uint8),
-            np.empty(size, np.int32),
-            np.empty(size, np.uint16),
-        )
+        out = Vertices.empty(size)
         _thinned(number, sums, cells, self.tops, grid, even, points, out)
         return out

@@ -9,8 +9,8 @@ from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.labels import recipe as module
 from stereotruth.labels import scene_inputs
 from stereotruth.labels.window_points import ground_in_view
-from stereotruth.surface.region import Region
 from stereotruth.surface.scale import PART
+from stereotruth.surface.surface_store import Region
 from stereotruth.surface.vertices import Vertices
 
 from ...synthetic.box_scene import Scene

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.files import read_sealed
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.lattice import LATTICE_DEG, Footprint
 from stereotruth.lidar.point_store import PointStore, open_stores
@@ -14,7 +13,7 @@ from stereotruth.surface import make_surface as module
 from stereotruth.surface.delaunay import MAX_PARTS
 from stereotruth.surface.make_surface import make_surface
 from stereotruth.surface.scale import PART, SurfaceScale
-from stereotruth.surface.surface_store import ARRAYS, TRIANGLES, SurfaceStore
+from stereotruth.surface.surface_store import GROUPS, TRIANGLES, Region, SurfaceStore
 
 from ...synthetic.box_scene import points_on, write_points
 from ...synthetic.las import write_las
@@ -56,19 +55,27 @@ class East:
         return self.lon, 30.0, self.lon + 0.01, 30.01
 
 
+def positions(store: SurfaceStore, block) -> np.ndarray:
+    """Lattice longitude, latitude, height [n, 3] of a block's vertices."""
+    own = store.vertices(block)
+    lon, lat = (
+        own[name] + np.int64(number * store.side * size)
+        for name, number, size in zip(("lon", "lat"), (block.col, block.row), store.scale.cell)
+    )
+    return np.stack([lon, lat, own["height"]], axis=1).astype(np.int64)
+
+
 def triangles(store: SurfaceStore) -> dict[str, set]:
     """All triangles of a surface by the lattice positions of their vertices, with their values."""
     found = {name: set() for name in TRIANGLES}
     for block in store.every:
-        a = store.arrays(block, list(ARRAYS))
-        vertices = a["vertices"]
-        positions = store.positions(block, vertices)
-        corners = np.stack([*positions, vertices["count"]], axis=1).astype(np.int64)
-        for name, into in found.items():
-            beside = ARRAYS[name].names[1:]
-            for triangle in a[name]:
-                told = tuple(triangle[field].tobytes() for field in beside)
-                into.add((corners[triangle["corner"]].tobytes(), *told))
+        counts = store.vertices(block)["count"].astype(np.int64)
+        corners = np.column_stack([positions(store, block), counts])
+        for name, columns in store.triangles(block).items():
+            corner, *beside = columns.values()
+            for k, triangle in enumerate(corner):
+                told = tuple(values[k].tobytes() for values in beside)
+                found[name].add((corners[triangle].tobytes(), *told))
     return found
 
 
@@ -84,7 +91,7 @@ def test_triangles_are_the_same_for_any_blocks(stores, tmp_path, monkeypatch):
         other = SurfaceStore(tmp_path / f"{side}")
         assert len(other.every) > 3 * len(one.every) or len(other.every) <= 4
         assert triangles(other) == expected
-        total = sum(len(other.arrays(block, ["facets"])["facets"]) for block in other.every)
+        total = sum(len(other.triangles(block)["facets"]["corner"]) for block in other.every)
         assert total == len(expected["facets"])  # each triangle once
 
 
@@ -94,10 +101,10 @@ def test_bytes_are_the_same_for_any_groups_workers_and_order(stores, tmp_path):
     for name, (made_of, workers, at_once) in ways.items():
         out = tmp_path / name / "s"
         make_surface(made_of, out, cell=CELL, workers=workers, blocks_at_once=at_once)
-    assert len({tree_digest(tmp_path / name / "s/blocks") for name in ways}) == 1
-    assert len(list((tmp_path / "a/s/blocks").iterdir())) > 16
-    one, *others = (read_sealed(tmp_path / name / "s/surface.json") for name in ways)
-    assert all(one["blocks"] == other["blocks"] for other in others)
+    one, *others = (SurfaceStore(tmp_path / name / "s").every for name in ways)
+    assert len(one) > 16 and all(one == other for other in others)  # with their checksums
+    groups = [len(list((tmp_path / name / "s" / GROUPS).iterdir())) for name in ways]
+    assert groups[0] == len(one) > groups[1] > groups[2]
 
 
 @pytest.mark.slow
@@ -149,7 +156,7 @@ def test_half_of_the_ground_has_the_triangles_of_all_there(stores, tmp_path):
     assert every.scale == half.scale
     whole, cut = set(half.every) & set(every.every), set(half.every) - set(every.every)
     assert whole and cut and len(half.every) < len(every.every)
-    assert {block.name for block in cut} < {block.name for block in every.every}
+    assert {block[:2] for block in cut} < {block[:2] for block in every.every}
     assert min(b.box[2] for b in half.every) * LATTICE_DEG > middle - 0.002
     reach = half.scale.height_reach / PART * CELL[0] * LATTICE_DEG
     of_all, of_half = (
@@ -163,24 +170,24 @@ def facets_of(store: SurfaceStore) -> set[tuple]:
     """Each facet as its vertices (lon, lat, degrees; height, steps), with its figures."""
     found = set()
     for block in store.every:
-        a = store.arrays(block, list(ARRAYS))
-        lon, lat, height = store.positions(block, a["vertices"])
-        vertices = np.stack([lon * LATTICE_DEG, lat * LATTICE_DEG, height], axis=1)
-        for corner, *figures in a["facets"].tolist():
-            found.add((*map(tuple, vertices[list(corner)].tolist()), *figures))
+        vertices = (positions(store, block) * [LATTICE_DEG, LATTICE_DEG, 1]).tolist()
+        corner, *figures = (values.tolist() for values in store.triangles(block)["facets"].values())
+        for three, *beside in zip(corner, *figures):
+            found.add((*(tuple(vertices[k]) for k in three), *beside))
     return found
 
 
 def test_a_damaged_block_is_named(stores, tmp_path):
     make_surface(stores, tmp_path / "s", cell=CELL)
     store = SurfaceStore(tmp_path / "s")
-    file = tmp_path / "s/blocks" / f"{store.every[0].name}.npz"
+    file = min((tmp_path / "s" / GROUPS).iterdir())
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.unlink()
     file.write_bytes(data)
-    with pytest.raises(InputError, match=f"{store.every[0].name}.npz"):
-        store.arrays(store.every[0], list(ARRAYS))
+    with pytest.raises(InputError, match=file.name):
+        for block in store.every:
+            store.window([block]).surface(Region(np.ones((99, 99), np.bool_)))
 
 
 @pytest.mark.parametrize("density", [0.01, 0.25, 1.0, 15.0])

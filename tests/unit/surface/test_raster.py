@@ -14,8 +14,7 @@ from stereotruth.surface.raster import (
     VISIBLE,
     ProjectedSurface,
 )
-from stereotruth.surface.rough_tops import RoughTops
-from stereotruth.surface.surface import GroundSurface
+from stereotruth.surface.surface import GroundSurface, RoughTops
 from stereotruth.surface.vertices import Vertices
 
 SHAPE, FIRST = (24, 30), (5, -3)
