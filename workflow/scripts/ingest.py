@@ -4,9 +4,9 @@ from stereotruth.core.job import in_own_process, job
 from stereotruth.core.products.file_parts import prune
 from stereotruth.core.products.making import making
 from stereotruth.core.products.provenance import describe
-from stereotruth.lidar.lattice import Footprint
 from stereotruth.lidar.frames import Epoch, Epochs
 from stereotruth.lidar.ingest import ingest
+from stereotruth.lidar.lattice import Footprint
 
 if __name__ == "__main__":
     scene, geoid = snakemake.wildcards.scene, snakemake.input.get("geoid") or None

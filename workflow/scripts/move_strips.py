@@ -4,8 +4,7 @@ from stereotruth.core.job import job
 from stereotruth.core.products.making import making
 from stereotruth.core.products.provenance import checksums, describe, digest
 from stereotruth.lidar.point_store import PointStore
-from stereotruth.lidar.strips import move_strips
-from stereotruth.lidar.strips import RECORD, StripOffsets
+from stereotruth.lidar.strips import RECORD, StripOffsets, move_strips
 
 if __name__ == "__main__":
     points, strips = snakemake.input.points, snakemake.input.strips

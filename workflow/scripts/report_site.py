@@ -8,8 +8,8 @@ from stereotruth.core.products.files import read_json
 from stereotruth.core.products.making import making
 from stereotruth.evaluate.report.index_page import write_index
 from stereotruth.evaluate.report.site_page import write_site_page
-from stereotruth.lidar.point_store import PointStore
 from stereotruth.lidar.point_statistics import roughness_m
+from stereotruth.lidar.point_store import PointStore
 from stereotruth.pages.page import INDEX
 from stereotruth.sensor.pair_quality import rate
 
