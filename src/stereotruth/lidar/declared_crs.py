@@ -370,13 +370,17 @@ def _same_horizontal(one: CRS, other: CRS, x: float, y: float) -> bool:
 
 
 def resolve(
-    header: laspy.LasHeader, lidar_crs: str | None, file: str | Path
+    header: laspy.LasHeader,
+    lidar_crs: str | None,
+    file: str | Path,
+    declared: LidarCRS | None = None,
 ) -> tuple[LidarCRS, list[str]]:
     """The system that applies to a file, and remarks for the user.
 
-    Raises InputError if the file declares none and ``lidar_crs`` is empty, and for depths.
+    ``declared``: of formats whose system is not in the header. Raises InputError if the file
+    declares none and ``lidar_crs`` is empty, and for depths.
     """
-    own, problems = header_crs(header)
+    own, problems = (declared, []) if declared is not None else header_crs(header)
     if depths := [text for text in problems if DEPTHS in text]:  # whatever the sheet says
         raise InputError(
             depths[0], file=file, remedy="write the file again with heights, which point up"

@@ -243,8 +243,7 @@ def _operation(source: CRS, target: int, place: tuple[float, float]) -> pyproj.T
     return next(good, None)
 
 
-@dataclass(frozen=True)
-class _Way:
+class _Way(NamedTuple):
     """From a frame to ITRF2020 by PROJ: operations, one after the other, and what they mean."""
 
     operations: tuple[pyproj.Transformer, ...]
@@ -252,11 +251,6 @@ class _Way:
     dynamic: bool
     spread_m: float = 0.0
     notes: tuple[str, ...] = ()
-
-    @property
-    def accuracy_m(self) -> float | None:
-        known = [one.accuracy for one in self.operations]
-        return None if any(value < 0 for value in known) else float(sum(known)) + self.spread_m
 
 
 def _way(datum: int, place: tuple[float, float]) -> _Way | None:
@@ -356,16 +350,10 @@ def frame_change(
             f"the date of the images is not known, it is taken as {goal:g}: places in ITRF2020 "
             f"move by {1000 * m_a:.0f} mm a year here"
         )
-    return FrameChange(
-        frame=name,
-        epoch=own,
-        target=target,
-        legs=tuple(legs),
-        accuracy_m=way.accuracy_m,
-        notes=tuple(notes),
-        geographic=_geographic(datum),
-        _steps=tuple(steps),
-    )
+    known = [operation.accuracy for operation in way.operations]
+    accuracy = None if any(value < 0 for value in known) else float(sum(known)) + way.spread_m
+    how = tuple(legs), accuracy, tuple(notes), _geographic(datum), tuple(steps)
+    return FrameChange(name, own, target, *how)
 
 
 # ------------------------------------------------------------------ plates

@@ -11,7 +11,7 @@ import os
 import re
 import sqlite3
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -210,13 +210,6 @@ class Candidate:
     grid: str
     path: Path | None
 
-    def undulation_m(self, lon: float, lat: float) -> float | None:
-        """Height of the surface over the ellipsoid; None where the grid is not here or has none."""
-        try:
-            return self.path and float(GeoidGrid(self.path)(np.array([lon]), np.array([lat]))[0])
-        except InputError:
-            return None
-
 
 def _every_candidate(lon: float, lat: float) -> list[Candidate]:
     """The geoids of a place, those of least ground first, each with a grid that is here if any."""
@@ -279,8 +272,11 @@ def fits(shift_m: float, lon: float, lat: float) -> str:
         return ""
     parts = [f"ellipsoidal {abs(shift_m):.1f} m"]
     for one in candidates:
-        if (undulation := one.undulation_m(lon, lat)) is not None:
-            parts.append(f"{one.surface} ({one.grid}) {abs(shift_m + undulation):.1f} m")
+        if one.path is None:
+            continue
+        with suppress(InputError):  # of a grid that has no value there
+            undulation_m = float(GeoidGrid(one.path)(np.array([lon]), np.array([lat]))[0])
+            parts.append(f"{one.surface} ({one.grid}) {abs(shift_m + undulation_m):.1f} m")
     text = f"no surface is declared for its heights; off by, if they are {'; '.join(parts)}"
     if missing := [one for one in candidates if one.path is None]:
         text += f"; of the place as well: {named(missing)}"

@@ -26,7 +26,6 @@ from typing import Any
 
 import laspy
 import numpy as np
-import pyproj
 import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import RasterioError
@@ -360,8 +359,8 @@ def _opened(file: Path) -> Iterator[tuple[Values, LidarCRS | None]]:
             ) from None
 
 
-def raster_header(file: Path) -> laspy.LasHeader:
-    """The header that a LAS file of the cells would have.
+def raster_header(file: Path) -> tuple[laspy.LasHeader, LidarCRS | None]:
+    """The header that a LAS file of the cells would have, and the system that the raster declares.
 
     ``point_count`` is the number of all cells; the lowest and highest height are NaN, since only
     the cells tell them. Raises InputError: missing, unreadable, no raster of heights.
@@ -379,19 +378,7 @@ def raster_header(file: Path) -> laspy.LasHeader:
         header.mins = np.array([*(header.offsets[:2] + half), np.nan])
         header.maxs = np.array([*(header.offsets[:2] + size - half), np.nan])
         header.point_count = rows * cols
-        if system is not None:
-            wkt = pyproj.CRS.from_wkt(raster.crs.to_wkt()).to_wkt()
-            if not system.has_vertical and system.vertical_unit_m is not None:  # of the band
-                wkt = (
-                    f'COMPOUNDCRS["unknown",{wkt},VERTCRS["unknown",VDATUM["unknown"],'
-                    'CS[vertical,1],AXIS["up",up],'
-                    f'LENGTHUNIT["{system.vertical_unit}",{system.vertical_unit_m!r}]]]'
-                )
-            if system.epoch is not None:
-                wkt = f"COORDINATEMETADATA[{wkt},EPOCH[{system.epoch!r}]]"
-            header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "", wkt.encode() + b"\0"))
-            header.global_encoding.wkt = True
-    return header
+    return header, system
 
 
 def sampled_heights(file: Path) -> tuple[float, float] | None:

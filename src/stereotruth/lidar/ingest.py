@@ -94,7 +94,8 @@ def survey(
     file = Path(file)
     points = open_points(file, by_nodes=footprint is not None, layers=url_of(file) is None)
     header = points.header
-    transform = to_wgs84(header, file, lidar_crs=lidar_crs, geoid=geoid, epochs=epochs)
+    how = {"lidar_crs": lidar_crs, "geoid": geoid, "epochs": epochs}
+    transform = to_wgs84(header, file, declared=points.declared, **how)
     _refuse_coarse(points, transform)
     part = points.part(_touching(transform, footprint))
     notes = [*transform.notes, *filter(None, (part.remark, points.remark))]
@@ -170,7 +171,7 @@ def ingest(
 
     def transform_of(extent: Floats | None) -> ToWGS84:
         how = {"lidar_crs": lidar_crs, "geoid": geoid, "epochs": epochs}
-        return to_wgs84(header, file, extent=extent, **how)
+        return to_wgs84(header, file, extent=extent, declared=points.declared, **how)
 
     transform = transform_of(None)
     _refuse_coarse(points, transform)

@@ -23,6 +23,7 @@ from ..core.products.file_parts import open_stream
 from ..core.products.remote_files import size_of
 from . import las_files
 from .catalogue_list import EPT
+from .declared_crs import LidarCRS
 from .octree import Touches, open_octree
 
 OCTREE = ".copc.laz"
@@ -51,12 +52,14 @@ class PointFile:
 
     ``header``: coordinate system, scales, offsets, count and bounds of the points; ``bytes``: all
     that there is to read; ``remark``: what users are to know of it; ``cell``: side of the cells
-    that points are the middles of, 0 of points that lie anywhere. ``layers``: see
+    that points are the middles of, 0 of points that lie anywhere; ``declared``: coordinate system
+    of formats that have it elsewhere than in a LAS header. ``layers``: see
     :func:`.las_files.check_layout`. Raises InputError if the file is missing or cannot be read.
     """
 
     cell = 0.0
     remark: str | None = None
+    declared: LidarCRS | None = None
 
     def __init__(self, path: Path, layers: bool = True) -> None:
         self.path = path
@@ -121,7 +124,8 @@ class RasterFile(PointFile):
         from . import height_raster  # GDAL, which few scenes need
 
         self._rasters = height_raster
-        self.path, self.header = path, height_raster.raster_header(path)
+        self.path = path
+        self.header, self.declared = height_raster.raster_header(path)
         self.bytes = size_of(path)
         self.cell = float(max(self.header.scales[:2])) * height_raster.PARTS
         self.remark = (

@@ -217,14 +217,15 @@ def to_wgs84(
     geoid: str | Path | None = None,
     extent: np.ndarray | None = None,
     epochs: Epochs | None = None,
+    declared: LidarCRS | None = None,
 ) -> ToWGS84:
     """The transformation that a LiDAR file needs.
 
-    ``lidar_crs``: see :func:`.declared_crs.parse_crs`; ``extent``: lowest and highest coordinates
-    of the points [2, 3], those that the header states if it is not given. Others, errors: see
-    :func:`transformation`.
+    ``lidar_crs``, ``declared``: see :func:`.declared_crs.resolve`; ``extent``: lowest and
+    highest coordinates of the points [2, 3], those that the header states if it is not given.
+    Others, errors: see :func:`transformation`.
     """
-    system, notes = resolve(header, lidar_crs or None, file)
+    system, notes = resolve(header, lidar_crs or None, file, declared)
     stated = np.array([header.mins, header.maxs], np.float64)
     x, y = np.abs(stated[:, :2]).max(axis=0)
     if system.horizontal.is_projected and x <= 360 and y <= 90:

@@ -204,7 +204,8 @@ def test_the_epoch_of_a_geotiff_is_read(tmp_path) -> None:
     assert before in data
     data = data.replace(before, struct.pack("<3H", 5120, 34736, 1))
     file.write_bytes(data.replace(struct.pack("<d", 6378137.0), struct.pack("<d", 2010.25)))
-    record = to_wgs84(raster_header(file), file, epochs=at(2020.0)).frame
+    header, system = raster_header(file)
+    record = to_wgs84(header, file, epochs=at(2020.0), declared=system).frame
     assert record["source"]["epoch"] == 2010.25
 
 
