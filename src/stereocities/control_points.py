@@ -12,7 +12,7 @@ from stereotruth.core.kernels import kernel
 from stereotruth.core.products.files import write_table
 
 from .camera import project_point
-from .cities import CITIES, CitySpec, SceneSpec
+from .cities import CitySpec, SceneSpec
 from .layout import scene_coordinates
 from .render import Camera, ImagedScene, prepare
 from .surfaces import (
@@ -220,14 +220,3 @@ def simulate_points(
     write_table(gcps_csv, measured, FIELDS)
     write_table(gcps_exact_csv, exact, FIELDS)
     write_table(checkpoints_csv, checks, FIELDS)
-
-
-def write_gcps(folder: str | Path, *, seed: int) -> list[Path]:
-    """Write the measured GCPs of every scene of the six cities to ``<folder>/<scene>.csv``."""
-    written = []
-    for city in CITIES.values():
-        for scene in city.scenes:
-            path = Path(folder) / f"{scene.name}.csv"
-            write_table(path, make_points(city, scene, seed=seed)[0], FIELDS)
-            written.append(path)
-    return written

@@ -28,12 +28,6 @@ from stereotruth.core.errors import InputError, install_extra
 IMPORTERS = ("import_module", "__import__", "spec_from_file_location", "run_path", "run_module")
 
 
-def _places(file: Path) -> list[Path]:
-    """Where a user's modules lie; what is installed is none of them."""
-    named = [Path(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p]
-    return [file.parent, Path(), *named]
-
-
 def _names(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Modules that are imported anywhere in a file: dots before the name, and the name."""
     for node in ast.walk(tree):
@@ -68,6 +62,8 @@ def imported_files(files: Iterable[Path]) -> list[Path]:
     Seen are import statements wherever they stand, and calls that import a name or a path that is
     written out. A file that is no Python counts as importing nothing.
     """
+    # where a user's modules lie besides; what is installed is none of them
+    named = [Path(p) for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p]
     found: dict[Path, Path] = {}
     todo = list(files)
     while todo:
@@ -80,7 +76,8 @@ def imported_files(files: Iterable[Path]) -> list[Path]:
         except (OSError, SyntaxError, ValueError, RecursionError):
             continue
         for level, name in _names(tree):
-            places = [[*file.parents, Path()][level - 1]] if level else _places(file)
+            own = [*file.parents, Path()][max(level - 1, 0)]
+            places = [own] if level else [own, Path(), *named]
             todo += _files_of(name, places)
     return sorted(found.values())
 
