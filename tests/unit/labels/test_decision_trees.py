@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereotruth.labels.decision_trees import COLUMNS, DecisionTrees
+from stereotruth.labels.decision_trees import TREE_COLUMNS, DecisionTrees
 
 TWO_TREES = """\
 0	0	-1	0	0	0	0.5
@@ -22,7 +22,7 @@ TWO_TREES = """\
 
 def sums(folder: Path) -> list[DecisionTrees]:
     file = folder / "trees.tsv"
-    file.write_text(COLUMNS.replace(" ", "\t") + "\n" + TWO_TREES)
+    file.write_text(TREE_COLUMNS.replace(" ", "\t") + "\n" + TWO_TREES)
     return DecisionTrees.load(file)
 
 
