@@ -269,7 +269,7 @@ def _hull(places: Sequence[tuple[Floats, Floats]]) -> Floats:
     return ground[:, corners_of_hull(*ground)]
 
 
-def _heights(
+def _heights_of_points(
     stores: Sequence[PointStore], lon: float, lat: float, reach: float
 ) -> tuple[float, float] | None:
     """Lowest and highest point (m) of the cells around a place; None where there are none."""
@@ -304,7 +304,7 @@ def _covered(
         lon, lat = (float(v) for v in left.localize(col, row, (low + high) / 2))
         if not np.isfinite(lon):
             return None
-        there = _heights(stores, lon, lat, 1e-5)
+        there = _heights_of_points(stores, lon, lat, 1e-5)
         if there is None:
             return None
         low, high = there
