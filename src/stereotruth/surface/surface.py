@@ -135,11 +135,7 @@ def cut_triangles(vertices: Vertices, corner: Steps, lines: Breaklines) -> Piece
 
 @kernel
 def _fill_positions(
-    parts: Floats,
-    origin: Ints,
-    size: int,
-    cell: tuple[int, int],
-    out: Vertices,
+    parts: Floats, origin: Ints, size: int, cell: tuple[int, int], out: Vertices
 ) -> None:
     """Positions of the corners of ``parts`` [n, 3, :], which count from the vertices ``origin``
     [n], to the vertices of ``out`` from ``size`` on."""
