@@ -70,7 +70,24 @@ def labels_around(scene: SceneInputs, rows: slice, cols: slice) -> LidarLabels |
 
 def lidar_labels(scene: SceneInputs, rows: slice, cols: slice) -> tuple[LidarLabels, Counts] | None:
     """What the LiDAR decides in a window, and the numbers of its points, all and in both frames;
-    None without a surface or points."""
+    None without a surface or points.
+
+    It is cut into strips of rows, so that the surface of dense points is not in memory at once.
+    """
+    labels, counts = LidarLabels.none((rows.stop - rows.start, cols.stop - cols.start)), []
+    for part in scene.windows.parts(rows, cols):
+        of_part = _labels_of_part(scene, part, cols)
+        if of_part is not None:
+            counts.append(of_part[1])
+            where = slice(part.start - rows.start, part.stop - rows.start)
+            for values, new in zip(labels, of_part[0]):
+                values[where] = new
+    return (labels, np.sum(counts, axis=0)) if counts else None
+
+
+def _labels_of_part(
+    scene: SceneInputs, rows: slice, cols: slice
+) -> tuple[LidarLabels, Counts] | None:
     window_points = scene.windows.footprint(rows, cols)
     blocks = () if window_points is None else scene.surface_blocks(rows, cols)
     if not blocks:

@@ -36,6 +36,7 @@ Bytes = NDArray[np.uint8]
 
 
 READ_POINTS = 1 << 20  # about as many are read at once
+MOST_POINTS = 2_000_000  # of a window whose surface is worked on at once
 BLOCK = 1 << 16  # points that go through the projection at once, while they are in the cache
 
 
@@ -216,6 +217,17 @@ class PointWindows:
                     share *= max(min(b, high) - max(a, low), 0.0) / max(high - low, 1e-12)
                 total += store.count * share
         return total
+
+    def parts(self, rows: slice, cols: slice) -> list[slice]:
+        """The rows of a window, cut so that no part expects more than MOST_POINTS; none without
+        points."""
+        footprint = self.footprint(rows, cols)
+        if footprint is None:
+            return []
+        count = int(self.expected(self.strips(rows, cols, footprint)) // MOST_POINTS) + 1
+        step = -(-(rows.stop - rows.start) // count)
+        every = range(rows.start, rows.stop, step)
+        return [slice(first, min(first + step, rows.stop)) for first in every]
 
     def touched(self, rows: slice, cols: slice) -> list[PointStore]:
         """The stores that have points of a window, or in the same cells."""
