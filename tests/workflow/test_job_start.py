@@ -25,7 +25,7 @@ STARTS = {
     "rectify": {"dask", "numba", "pydantic", "rasterio", "zarr"},
     "project": {"dask", "numba", "pydantic", "zarr"},
     "grid_truth": {"numba", "rasterio", "zarr"},
-    "match": {"pydantic", "rasterio"},
+    "match": {"pydantic", "rasterio", "zarr"},
 }
 
 
