@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from stereotruth.align.alignment import Alignment
 from stereotruth.core.config.configuration import Export
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.making import rule_job

@@ -1,6 +1,7 @@
 """What stands in a synthetic city, for the jobs that look at it."""
 
 from stereocities.cities import city_of
+from stereocities.world import write_surfaces
 from stereotruth.core.products.making import rule_job
 
 if __name__ == "__main__":
