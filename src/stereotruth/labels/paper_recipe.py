@@ -108,13 +108,15 @@ def _sample(
     image: Singles, row: int, col: int, size: int, fx: float, fy: float, out: Floats
 ) -> None:
     """A window of ``size`` x ``size`` bilinear samples, the first (fx, fy) px from a pixel."""
-    k = 0
-    for j in range(row, row + size):
-        for i in range(col, col + size):
-            above = (1.0 - fx) * image[j, i] + fx * image[j, i + 1]
-            below = (1.0 - fx) * image[j + 1, i] + fx * image[j + 1, i + 1]
-            out[k] = (1.0 - fy) * above + fy * below
-            k += 1
+    for j in range(size + 1):
+        line = image[row + j, col : col + size + 1]
+        above, below = out[(j - 1) * size : j * size], out[j * size : (j + 1) * size]
+        for i in range(size):
+            value = (1.0 - fx) * line[i] + fx * line[i + 1]
+            if j > 0:
+                above[i] += fy * value
+            if j < size:
+                below[i] = (1.0 - fy) * value
 
 
 @kernel
