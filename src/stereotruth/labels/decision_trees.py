@@ -24,7 +24,7 @@ Steps = NDArray[np.int32]
 COLUMNS = "sum tree feature limit missing_is_below above value"
 LEAF = -1  # as the feature of a node that asks none
 MOST_LEAVES = 31  # of a tree: bits of a whole number
-BLOCK = 256  # pixels that are asked at once
+PIXELS_AT_ONCE = 256
 
 
 class DecisionTrees(NamedTuple):
@@ -46,17 +46,17 @@ class DecisionTrees(NamedTuple):
     @classmethod
     def load(cls, file: Path) -> list[DecisionTrees]:
         """Those of each sum in a table of the columns COLUMNS, tab-separated."""
-        of, *columns = np.loadtxt(file, np.float64, delimiter="\t", skiprows=1, unpack=True)
+        sums, *columns = np.loadtxt(file, np.float64, delimiter="\t", skiprows=1, unpack=True)
         types = (np.int32, np.int32, np.float32, np.int32, np.int32, np.float32)
         typed = [column.astype(kind) for column, kind in zip(columns, types, strict=True)]
-        return [cls(*(column[of == number] for column in typed)) for number in np.unique(of)]
+        return [cls(*(column[sums == number] for column in typed)) for number in np.unique(sums)]
 
     @classmethod
     def save(cls, file: Path, sums: Sequence[DecisionTrees]) -> None:
         """Those of several ``sums`` as a table for :meth:`load`."""
         lines = [COLUMNS.split()]
-        for number, of in enumerate(sums):
-            lines += [[str(number), *(f"{float(v):.7g}" for v in node)] for node in zip(*of)]
+        for number, trees in enumerate(sums):
+            lines += [[str(number), *(f"{float(v):.7g}" for v in node)] for node in zip(*trees)]
         file.write_text("".join("\t".join(line) + "\n" for line in lines), encoding="utf-8")
 
     def sum_at(self, features: Singles) -> Singles:
@@ -95,10 +95,10 @@ def _sum_at(
 ) -> None:
     """``ends`` [trees + 1]: first nodes of the trees, and the number of all nodes; ``kept``
     [nodes]: the leaves (bits) of a tree that are not below a node; ``values`` [trees, leaves]."""
-    leaves, found = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
+    leaves, reached = np.empty(PIXELS_AT_ONCE, np.int32), np.empty(PIXELS_AT_ONCE, np.float32)
     every, last = np.int32(-1), values.shape[1] - 1
-    for start in range(0, features.shape[1], BLOCK):
-        total = out[start : start + BLOCK]
+    for start in range(0, features.shape[1], PIXELS_AT_ONCE):
+        total = out[start : start + PIXELS_AT_ONCE]
         total[:] = np.float32(0.0)
         size = total.size
         for tree in range(len(values)):
@@ -113,10 +113,10 @@ def _sum_at(
                 else:
                     for k in range(size):
                         leaves[k] &= every if x[k] <= most else others
-            found[:] = values[tree, last]
+            reached[:] = values[tree, last]
             for leaf in range(last - 1, -1, -1):
                 bit, value = np.int32(1 << leaf), values[tree, leaf]
                 for k in range(size):
-                    found[k] = value if leaves[k] & bit != 0 else found[k]
+                    reached[k] = value if leaves[k] & bit != 0 else reached[k]
             for k in range(size):
-                total[k] += found[k]
+                total[k] += reached[k]
