@@ -24,7 +24,6 @@ Floats = NDArray[np.float64]
 Four = tuple[float, float, float, float]
 
 COLOURS = ("red", "green", "blue")  # layers of rectified images in colour, beside `image`
-
 FORMULA = (
     "For each image: x = x_affine . (col, row, 1) + S(x_spline; col, row) and "
     "y = y_affine . (col, row, 1) + S(y_spline; col, row); all in px. (col, row) is the pixel "

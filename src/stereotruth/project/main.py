@@ -39,12 +39,10 @@ scene_app = typer.Typer(no_args_is_help=True, help="The scenes of the project.")
 gcps_app = typer.Typer(no_args_is_help=True, help="Ground control points.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(gcps_app, name="gcps")
-
 Configured = Annotated[
     list[Path] | None,
     typer.Option("--configfile", help="Read this instead of config.yaml; may be given again."),
 ]
-
 AllowedHosts = Annotated[
     list[str] | None,
     typer.Option(help="Another host of which the catalogue may name tiles; may be given again."),
