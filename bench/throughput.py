@@ -71,7 +71,7 @@ PROJECT_JOB = """
 import glob, json, os, sys
 from stereotruth.labels.project import project_scene
 from stereotruth.labels.scene_inputs import SceneInputs
-from stereotruth.core.config.labels import LabelSettings
+from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.job import job
 left, right, points, out, log, alignment, settings, options = sys.argv[1:]
 points, settings = json.loads(points), LabelSettings(**json.loads(settings))
