@@ -72,6 +72,10 @@ OF_TWINS = (
 ALONE = {"texture": "a year apart", "sun": "a year apart", "leaves": "a year apart"}
 LATER_SUN_DEG = (35.0, -12.0)  # azimuth and elevation of the right image's sun less the left's
 
+HEADER = ["kind", "images", "changed, 1000 px", "without a label, %", "of these `changed`, %",
+          "right reason, %", "unchanged lost, %", "error, px", "σ, px", "within σ, %",
+          "within 2 σ, %"]  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Case:
@@ -277,11 +281,6 @@ class Row:
             f"{self.sigma / max(self.labels, 1):.3f}",
             share(self.within, self.labels), share(self.within_two, self.labels),
         ]  # fmt: skip
-
-
-HEADER = ["kind", "images", "changed, 1000 px", "without a label, %", "of these `changed`, %",
-          "right reason, %", "unchanged lost, %", "error, px", "σ, px", "within σ, %",
-          "within 2 σ, %"]  # fmt: skip
 
 
 def main() -> None:

@@ -54,6 +54,32 @@ DENSITIES = 10.6, 2.6, 5.0, 4.0  # points/m²
 EDGE_PX = 4  # from edges of truth: ground beyond is judged
 GROUND = 1
 
+# Frames.
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).parents[1]
+LIDAR = ("in/lidar", "national")  # in WGS 84, in the frame
+DEMO_SEED, SPACING_M, SIDE_PX, TILE_PX = 1, 0.5, 560, 128
+NAD83 = (
+    "+proj=helmert +x=1.0039 +y=-1.90961 +z=-0.54117 +rx=0.02678138 +ry=-0.00042027 "
+    "+rz=0.01093206 +s=-5.109e-05 +dx=0.00079 +dy=-0.0007 +dz=-0.00124 +drx=6.667e-05 "
+    "+dry=-0.00075744 +drz=-5.133e-05 +ds=-7.201e-05 +t_epoch=2010 +convention=coordinate_frame"
+)
+GDA2020 = (
+    "+inv +proj=helmert +x=0.0014 +y=0.0009 +z=-0.0014 +s=0.00042 +dy=0.0001 +dz=-0.0002 "
+    "+t_epoch=2015 +convention=position_vector +step +proj=helmert +drx=0.00150379 "
+    "+dry=0.00118346 +drz=0.00120716 +t_epoch=2020 +convention=coordinate_frame"
+)
+ETRS89 = (
+    "+proj=helmert +rx=0.002236 +ry=0.013494 +rz=-0.019578 +drx=8.6e-05 +dry=0.000519 "
+    "+drz=-0.000753 +t_epoch=2015 +convention=position_vector"
+)
+NZGD2000 = (  # the plate's motion back to 2000.0, then ITRF96 at that epoch
+    "+inv +proj=helmert +drx=0.001487 +dry=0.001175 +drz=0.001223 +t_epoch=2000 "
+    "+convention=position_vector +step +inv +proj=helmert +x=-0.005 +y=-0.0051 +z=0.0314 "
+    "+rz=-0.00006 +s=-0.00218 +convention=position_vector"
+)
+
 
 def drawn_strips(number: int, side_px: int, jitter_px: float) -> CitySpec:
     """A city of one scene, flown in strips, whose images may jitter."""
@@ -124,31 +150,6 @@ def strips(given: argparse.Namespace) -> None:
 
 
 # ------------------------------------------------------------------------------- frames
-
-Floats = NDArray[np.float64]
-
-ROOT = Path(__file__).parents[1]
-LIDAR = ("in/lidar", "national")  # in WGS 84, in the frame
-DEMO_SEED, SPACING_M, SIDE_PX, TILE_PX = 1, 0.5, 560, 128
-NAD83 = (
-    "+proj=helmert +x=1.0039 +y=-1.90961 +z=-0.54117 +rx=0.02678138 +ry=-0.00042027 "
-    "+rz=0.01093206 +s=-5.109e-05 +dx=0.00079 +dy=-0.0007 +dz=-0.00124 +drx=6.667e-05 "
-    "+dry=-0.00075744 +drz=-5.133e-05 +ds=-7.201e-05 +t_epoch=2010 +convention=coordinate_frame"
-)
-GDA2020 = (
-    "+inv +proj=helmert +x=0.0014 +y=0.0009 +z=-0.0014 +s=0.00042 +dy=0.0001 +dz=-0.0002 "
-    "+t_epoch=2015 +convention=position_vector +step +proj=helmert +drx=0.00150379 "
-    "+dry=0.00118346 +drz=0.00120716 +t_epoch=2020 +convention=coordinate_frame"
-)
-ETRS89 = (
-    "+proj=helmert +rx=0.002236 +ry=0.013494 +rz=-0.019578 +drx=8.6e-05 +dry=0.000519 "
-    "+drz=-0.000753 +t_epoch=2015 +convention=position_vector"
-)
-NZGD2000 = (  # the plate's motion back to 2000.0, then ITRF96 at that epoch
-    "+inv +proj=helmert +drx=0.001487 +dry=0.001175 +drz=0.001223 +t_epoch=2000 "
-    "+convention=position_vector +step +inv +proj=helmert +x=-0.005 +y=-0.0051 +z=0.0314 "
-    "+rz=-0.00006 +s=-0.00218 +convention=position_vector"
-)
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,8 @@ SEED = 2026
 SPACING_M = 0.5  # of the LiDAR's points
 FOLDER = Path("results/pairs")
 
+TERMS = ("base over height", "way of the shadows", "roughness over the usual one")
+
 
 def exact_image(site: SiteSpec, name: str, folder: Path) -> SiteImage:
     """An image of a site, made in the folder, with its RPCs corrected by their own bias."""
@@ -102,9 +104,6 @@ def rows_of(number: int, images: int, side_px: int) -> list[dict]:
     kept.parent.mkdir(parents=True, exist_ok=True)
     kept.write_text(json.dumps(rows))
     return rows
-
-
-TERMS = ("base over height", "way of the shadows", "roughness over the usual one")
 
 
 def fit(rows: list[dict]) -> np.ndarray:

@@ -56,6 +56,21 @@ COLUMNS_OF_SCENES = (
     "scene", "city", "left_image", "right_image", "lidar", "lidar_crs", "geoid", "gcps",
 )  # fmt: skip
 
+PERCENT = (
+    "seen_labelled",
+    "ground_changed",
+    "roof_changed",
+    "matches_off_ground",
+    "matches_off_roof",
+)
+HEADER = {
+    "pair": "pair", "seen_labelled": "seen labelled, %", "ground_changed": "ground changed, %",
+    "roof_changed": "roofs changed, %", "check_points": "check points", "bias": "bias, px",
+    "nmad": "NMAD, px", "y_parallax": "y, px", "sigma_median": "σ, px",
+    "correlation": "correlation", "matches_off_ground": "matches off, ground, %",
+    "matches_off_roof": "roofs, %", "east": "east, m", "north": "north, m", "up": "up, m",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Site:
@@ -332,22 +347,6 @@ def _alignment(pair: Pair) -> Path:
 
 def _share(part: Bools, of: Bools) -> float:
     return float((part & of).sum() / max(of.sum(), 1))
-
-
-PERCENT = (
-    "seen_labelled",
-    "ground_changed",
-    "roof_changed",
-    "matches_off_ground",
-    "matches_off_roof",
-)
-HEADER = {
-    "pair": "pair", "seen_labelled": "seen labelled, %", "ground_changed": "ground changed, %",
-    "roof_changed": "roofs changed, %", "check_points": "check points", "bias": "bias, px",
-    "nmad": "NMAD, px", "y_parallax": "y, px", "sigma_median": "σ, px",
-    "correlation": "correlation", "matches_off_ground": "matches off, ground, %",
-    "matches_off_roof": "roofs, %", "east": "east, m", "north": "north, m", "up": "up, m",
-}  # fmt: skip
 
 
 def _cell(name: str, value: Any) -> str:

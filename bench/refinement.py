@@ -58,6 +58,11 @@ FAR_SIGMAS = 3.0
 Row = dict[str, Any]
 Floats = NDArray[np.float64]
 
+COLUMNS = [
+    "crowns, %", "points/m²", "conditions", "control points alone: bias", "mean abs",
+    "refined: bias", "mean abs", "stated σ", "tie points", "doubts",
+]  # fmt: skip
+
 
 def accuracy_draws(count: int) -> Iterator[tuple[Draw, int]]:
     """Wooded suburbs and parks in turn, each at 4 and at 1 points/m², with 15 control points."""
@@ -368,12 +373,6 @@ def rows_of(options: argparse.Namespace) -> Iterator[Row]:
         row = json.loads(file.read_text(encoding="utf-8"))
         print(f"{number + 1} of {len(draws)}: {' '.join(cells(row))}", flush=True)
         yield row
-
-
-COLUMNS = [
-    "crowns, %", "points/m²", "conditions", "control points alone: bias", "mean abs",
-    "refined: bias", "mean abs", "stated σ", "tie points", "doubts",
-]  # fmt: skip
 
 
 def cells(row: Row) -> list[str]:

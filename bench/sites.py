@@ -56,6 +56,9 @@ from stereotruth.surface.scale import ground_cell
 SEED = 2030
 SPACING_M = 0.5  # of the LiDAR's points
 
+# Closure.
+CASES = ("joint", "separate")
+
 
 def site_folder(site: SiteSpec, number: int, options: argparse.Namespace) -> Path:
     """The folder of a site's images, point stores and control points, made once."""
@@ -226,8 +229,6 @@ def compare_alignments(options: argparse.Namespace) -> None:
 
 
 # ------------------------------------------------------------------------------- closure
-
-CASES = ("joint", "separate")
 
 
 def labelled(

@@ -33,6 +33,34 @@ ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
 EARTH_RATE = 7.292115e-5  # rad/s
 GRAVITY = 3.986004418e14  # m³/s²
 
+WAVES, WAVE = 37, 38  # number of the waves of jitter, and the first one's fields
+ROLL_WAVE, PITCH_WAVE, PER_ROW, PHASE = 0, 1, 2, 3  # amplitudes and frequency in rad, phase
+MOST_WAVES = 8
+END = WAVE + 4 * MOST_WAVES
+
+PER_COL, PER_LINE = 12, 35  # what jitter is measured by: 1, so that it is in px
+MIDDLE_ROW = 36
+GROUND_X, GROUND_Y = END, END + 10  # cubics of (u, v): where a pixel looks at z = 0
+STATION_X, STATION_Y, STATION_Z = END + 20, END + 23, END + 26  # quadratic in v; one height
+# u = (col − MIDDLE_COL) / COLS, v likewise by MIDDLE_ROW
+MIDDLE_COL, COLS, ROWS = END + 27, END + 28, END + 29
+INVERSE = END + 30  # (col, row) per metre of ground, row by row
+RPC_SIZE = END + 34
+CLOSE_PX = 1e-7
+
+ALTITUDE_M = 505e3
+INCLINATION_DEG = 97.4
+LOOK_DEG = {"left": -5.0, "right": 26.0}  # along track, negative looks back
+
+RADIUS, MOTION, P, Q = 0, 1, 2, 5  # orbit: radius, inertial rate, in-plane axes in ECEF at time 0
+TIME0, PERIOD = 8, 9  # time of row 0, seconds per row
+LOOK, COL0, PITCH_PER_COL = 10, 11, 12  # tangent of the look, principal column, tangent per px
+ROLL, PITCH, YAW, TIME_REF = 13, 16, 19, 22  # polynomials of (time - TIME_REF), degree 2, rad
+FRAME = 23  # origin and axes of the world frame
+SLOPE = 35  # d(look tangent)/d(row) of a ground point, start value of the solver
+ROWS_MID = 36
+SIZE = END
+
 
 def geodetic_to_ecef(lon: np.ndarray, lat: np.ndarray, height: np.ndarray) -> np.ndarray:
     """ECEF metres [..., 3] of WGS 84 degrees and ellipsoidal metres."""
@@ -136,12 +164,6 @@ def world_to_geodetic_point(frame, x, y, z):
     )
 
 
-WAVES, WAVE = 37, 38  # number of the waves of jitter, and the first one's fields
-ROLL_WAVE, PITCH_WAVE, PER_ROW, PHASE = 0, 1, 2, 3  # amplitudes and frequency in rad, phase
-MOST_WAVES = 8
-END = WAVE + 4 * MOST_WAVES
-
-
 @inlined
 def swings(cam, row):
     """What all waves together add to roll and pitch at a line."""
@@ -152,17 +174,6 @@ def swings(cam, row):
         roll += cam[at + ROLL_WAVE] * swing
         pitch += cam[at + PITCH_WAVE] * swing
     return roll, pitch
-
-
-PER_COL, PER_LINE = 12, 35  # what jitter is measured by: 1, so that it is in px
-MIDDLE_ROW = 36
-GROUND_X, GROUND_Y = END, END + 10  # cubics of (u, v): where a pixel looks at z = 0
-STATION_X, STATION_Y, STATION_Z = END + 20, END + 23, END + 26  # quadratic in v; one height
-# u = (col − MIDDLE_COL) / COLS, v likewise by MIDDLE_ROW
-MIDDLE_COL, COLS, ROWS = END + 27, END + 28, END + 29
-INVERSE = END + 30  # (col, row) per metre of ground, row by row
-RPC_SIZE = END + 34
-CLOSE_PX = 1e-7
 
 
 @inlined
@@ -210,20 +221,6 @@ def project_by_rpc(cam, x, y, z, line):
         if abs(step_col) < CLOSE_PX and abs(step_row) < CLOSE_PX:
             break
     return col, row
-
-
-ALTITUDE_M = 505e3
-INCLINATION_DEG = 97.4
-LOOK_DEG = {"left": -5.0, "right": 26.0}  # along track, negative looks back
-
-RADIUS, MOTION, P, Q = 0, 1, 2, 5  # orbit: radius, inertial rate, in-plane axes in ECEF at time 0
-TIME0, PERIOD = 8, 9  # time of row 0, seconds per row
-LOOK, COL0, PITCH_PER_COL = 10, 11, 12  # tangent of the look, principal column, tangent per px
-ROLL, PITCH, YAW, TIME_REF = 13, 16, 19, 22  # polynomials of (time - TIME_REF), degree 2, rad
-FRAME = 23  # origin and axes of the world frame
-SLOPE = 35  # d(look tangent)/d(row) of a ground point, start value of the solver
-ROWS_MID = 36
-SIZE = END
 
 
 @inlined

@@ -23,6 +23,19 @@ from stereotruth.core.products.files import atomic_file
 LEFT_GSD_M = 0.65
 RIGHT_GSD_M = 0.80
 
+TILES_A_CITY = 4  # two by two
+# least and most of each, in metres, degrees and shares; relief is drawn by its logarithm
+RELIEF_M = (4.0, 420.0)
+TOWERS_M = (22.0, 105.0)
+LON, LAT = (75.0, 122.0), (20.0, 38.0)
+APART_DEG = 0.2  # from the cities that tests show
+FIRST_SEED = 1 << 20  # of worlds; the others' are below
+GREATEST_LEAN = 0.35  # relief over wavelength at most
+FLAT = {"towers": 3, "slabs": 4, "lowrise": 3, "industry": 2, "park": 1.5, "fields": 2}
+STEEP = {"towers": 1, "slabs": 1, "lowrise": 2, "village": 3, "fields": 2, "forest": 3, "bare": 0.5}
+
+FOLDER = Path("data/synthetic")  # of the working directory
+
 
 @dataclass(frozen=True)
 class SceneSpec:
@@ -333,18 +346,6 @@ def tile_index(scene: SceneSpec, file_name: str) -> tuple[int, int]:
     return int(east), int(north)
 
 
-TILES_A_CITY = 4  # two by two
-# least and most of each, in metres, degrees and shares; relief is drawn by its logarithm
-RELIEF_M = (4.0, 420.0)
-TOWERS_M = (22.0, 105.0)
-LON, LAT = (75.0, 122.0), (20.0, 38.0)
-APART_DEG = 0.2  # from the cities that tests show
-FIRST_SEED = 1 << 20  # of worlds; the others' are below
-GREATEST_LEAN = 0.35  # relief over wavelength at most
-FLAT = {"towers": 3, "slabs": 4, "lowrise": 3, "industry": 2, "park": 1.5, "fields": 2}
-STEEP = {"towers": 1, "slabs": 1, "lowrise": 2, "village": 3, "fields": 2, "forest": 3, "bare": 0.5}
-
-
 def training_city(number: int, seed: int, side_px: int) -> CitySpec:
     """City ``number`` of ``seed``, whose one scene has a left image of ``side_px`` squared.
 
@@ -406,9 +407,6 @@ def cities_for(count: int) -> tuple[list[int], list[int]]:
     training = -(-count // TILES_A_CITY)
     validation = max(1, round(count / (10 * TILES_A_CITY)))
     return [2 * k + 1 for k in range(training)], [2 * k for k in range(validation)]
-
-
-FOLDER = Path("data/synthetic")  # of the working directory
 
 
 def file_of(name: str) -> Path:

@@ -30,6 +30,31 @@ from .surfaces import (
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
+ZONE_KINDS = (
+    "towers", "slabs", "lowrise", "village", "industry", "park", "fields", "forest", "bare",
+)  # fmt: skip
+BUILT = ZONE_KINDS[:5]
+# block length, block width, half width of the street (m) of each kind of land use
+BLOCKS = {
+    "towers": (118, 98, 8.5), "slabs": (124, 92, 6.0), "lowrise": (86, 62, 4.0),
+    "village": (64, 50, 2.2), "industry": (176, 122, 6.5), "park": (150, 110, 2.5),
+    "fields": (96, 38, 1.2), "forest": (400, 400, 1.0), "bare": (400, 400, 1.0),
+}  # fmt: skip
+
+TERRAIN_STEP_M = 10.0
+TEXTURE_SIZE = 1024
+FINE_STEP_M = 0.25
+BROAD_STEP_M = 2.0
+
+CAR_M = (4.4, 1.8, 1.5)  # length, width, height
+VAN_M = (7.5, 2.3, 2.8)
+VANS = 0.12  # share of the vehicles
+NARROWEST_M = 3.5  # half width of a street that vehicles use
+LANE = 0.35  # distance from the middle over half the width
+SLOW_M = (0.5, 6.0)  # way of a vehicle in slow traffic between the views
+APART_M = 15.0  # more than two bodies and the ways of both
+PARKED, SLOW, LEAVING, COMING = 0.25, 0.35, 0.15, 0.15  # shares; the others are in the LiDAR only
+
 
 def frame_of(city: CitySpec) -> LocalFrame:
     """The city's world frame."""
@@ -86,18 +111,6 @@ def extent(city: CitySpec) -> tuple[float, float, float, float]:
     low = np.floor(np.min(corners, axis=0) / CELL_M) * CELL_M
     high = np.ceil(np.max(corners, axis=0) / CELL_M) * CELL_M
     return low[0], low[1], high[0], high[1]
-
-
-ZONE_KINDS = (
-    "towers", "slabs", "lowrise", "village", "industry", "park", "fields", "forest", "bare",
-)  # fmt: skip
-BUILT = ZONE_KINDS[:5]
-# block length, block width, half width of the street (m) of each kind of land use
-BLOCKS = {
-    "towers": (118, 98, 8.5), "slabs": (124, 92, 6.0), "lowrise": (86, 62, 4.0),
-    "village": (64, 50, 2.2), "industry": (176, 122, 6.5), "park": (150, 110, 2.5),
-    "fields": (96, 38, 1.2), "forest": (400, 400, 1.0), "bare": (400, 400, 1.0),
-}  # fmt: skip
 
 
 def draw_zones(
@@ -217,12 +230,6 @@ def covered(c, x, y):
     return a < c[6] - gap_a or b > -c[7] + gap_b
 
 
-TERRAIN_STEP_M = 10.0
-TEXTURE_SIZE = 1024
-FINE_STEP_M = 0.25
-BROAD_STEP_M = 2.0
-
-
 def spectral_noise(
     rng: np.random.Generator,
     shape: tuple[int, int],
@@ -316,16 +323,6 @@ def make_terrain(
     if not c.river_m and not c.lakes:
         water = -1e9
     return z, water
-
-
-CAR_M = (4.4, 1.8, 1.5)  # length, width, height
-VAN_M = (7.5, 2.3, 2.8)
-VANS = 0.12  # share of the vehicles
-NARROWEST_M = 3.5  # half width of a street that vehicles use
-LANE = 0.35  # distance from the middle over half the width
-SLOW_M = (0.5, 6.0)  # way of a vehicle in slow traffic between the views
-APART_M = 15.0  # more than two bodies and the ways of both
-PARKED, SLOW, LEAVING, COMING = 0.25, 0.35, 0.15, 0.15  # shares; the others are in the LiDAR only
 
 
 def place_vehicles(city: CitySpec, s: Surfaces, sites: cKDTree) -> Objects:

@@ -33,7 +33,6 @@ from .world import surfaces_of, world_of
 
 log = logging.getLogger("stereotruth")
 
-
 FLYING_HEIGHT_M = 1100.0
 LINE_SPACING_M = 540.0  # ±13.8° off nadir
 NOISE_M = 0.03
@@ -42,6 +41,13 @@ WATER_RETURNS = 0.15
 SECOND_RETURNS = 0.45
 INSIDE = 0.3  # share of the pulses through a crown's top that end in the crown
 PULSES_A_CHUNK = 50_000  # so many stay in the cache
+
+OVERLAP = 0.3  # of a strip's width, shared with the next one
+SPEED_M_S = 60.0
+START_S = 275_400_000.0  # adjusted GPS time of the first strip, in 2020
+TURN_S = 240.0  # from the end of a strip to the beginning of the next one
+EDGE_OF_LINE = np.uint8(0x80)
+EDGE_PULSES = 3.0  # from a strip's end: lines that end earlier leave its ground, not the strip
 
 
 def tile_box(city: CitySpec, scene: SceneSpec, index: tuple[int, int]) -> tuple[float, ...]:
@@ -331,14 +337,6 @@ def simulate_lidar_tile(
         )
     log.info("%s: %.2f million points", tile_name, counts.sum() / 1e6)
     return {str(k): int(v) for k, v in enumerate(counts) if v}
-
-
-OVERLAP = 0.3  # of a strip's width, shared with the next one
-SPEED_M_S = 60.0
-START_S = 275_400_000.0  # adjusted GPS time of the first strip, in 2020
-TURN_S = 240.0  # from the end of a strip to the beginning of the next one
-EDGE_OF_LINE = np.uint8(0x80)
-EDGE_PULSES = 3.0  # from a strip's end: lines that end earlier leave its ground, not the strip
 
 
 class FlownStrip(NamedTuple):

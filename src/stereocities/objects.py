@@ -37,6 +37,14 @@ from .surfaces import (
 
 FLAT, GRAVEL, TILES, SHEET = range(4)
 
+ROW_STEP = 2.3  # distance of crowns in a row over their mean radius
+DENSE = 3.0  # ground of a crown in a forest over the square of its mean radius
+WOODS_M = (80.0, 600.0)  # wavelengths of where woods are
+WOODS_STEP_M, WOODS_SIZE = 8.0, 512
+CORE = 0.85  # of a crown's radius and half height
+LOBE = (0.28, 0.42)  # radius of a lobe over the crown's
+BOUGHS, BOUGH = 3, 0.16  # number, and radius over the crown's
+
 
 @dataclass(frozen=True)
 class House:
@@ -276,15 +284,6 @@ def choose_changed(
         view[np.isin(group, chosen[:count])] = IN_IMAGES
         view[np.isin(group, chosen[count:])] = IN_LIDAR
     return view
-
-
-ROW_STEP = 2.3  # distance of crowns in a row over their mean radius
-DENSE = 3.0  # ground of a crown in a forest over the square of its mean radius
-WOODS_M = (80.0, 600.0)  # wavelengths of where woods are
-WOODS_STEP_M, WOODS_SIZE = 8.0, 512
-CORE = 0.85  # of a crown's radius and half height
-LOBE = (0.28, 0.42)  # radius of a lobe over the crown's
-BOUGHS, BOUGH = 3, 0.16  # number, and radius over the crown's
 
 
 def place_canopy(

@@ -39,6 +39,9 @@ NUMBERS = ("line_off", "samp_off", "lat_off", "long_off", "height_off", "line_sc
            "lat_scale", "long_scale", "height_scale")  # fmt: skip
 RATIOS = "line_num_coeff", "line_den_coeff", "samp_num_coeff", "samp_den_coeff"
 
+STATIONS_M = 2e5, 4e7  # heights of satellites
+MISFIT_PX = 0.02
+
 
 @dataclass(frozen=True)
 class RPC:
@@ -196,10 +199,6 @@ def fit_rpc(
                         scale[1], scale[0], lat_scale, lon_scale, h_scale])  # fmt: skip
     rms_px = float(np.sqrt((miss**2).sum(axis=1).mean()))
     return FittedRPC(numbers, np.stack([*line, *samp]), bias, rms_px)
-
-
-STATIONS_M = 2e5, 4e7  # heights of satellites
-MISFIT_PX = 0.02
 
 
 def read_rpc(file: str | Path) -> GivenRPC:

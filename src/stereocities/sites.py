@@ -53,6 +53,12 @@ LOWEST_SUN_DEG = 28.0  # shadows reach no farther than rays are followed
 STEEPEST = 0.15  # relief over the side of an image
 TURNED = 1.24  # side of the area over that of the image: passes cross at an angle
 
+log = logging.getLogger("stereotruth")
+
+RPC_MARGIN_M = 30.0  # heights of small images should not range wider than their ground
+FIELDS = ("id", "lon", "lat", "height", "image", "col", "row")
+IN_IMAGE = ("lon", "lat", "height", "surface", "changed", "covered")  # truth of one image
+
 
 def make_scene(
     city: CitySpec, scene: SceneSpec, folder: Path, *, spacing_m: float, seed: int
@@ -215,13 +221,6 @@ def _drawn_time(city: CitySpec, rng: np.random.Generator) -> datetime:
         acquired = day + timedelta(seconds=round(3600 * hours))
         if sun_at(acquired, city.lon, city.lat)[1] > LOWEST_SUN_DEG:
             return acquired
-
-
-log = logging.getLogger("stereotruth")
-
-RPC_MARGIN_M = 30.0  # heights of small images should not range wider than their ground
-FIELDS = ("id", "lon", "lat", "height", "image", "col", "row")
-IN_IMAGE = ("lon", "lat", "height", "surface", "changed", "covered")  # truth of one image
 
 
 @lru_cache(maxsize=64)

@@ -25,6 +25,17 @@ PATCHES_A_CELL = 32  # of surfaces.CELL_M, along each side
 NOTHING = -1e9  # z where no patch stands
 STEP_M = 0.05  # what a ray enters deeper below a patch's top than this is its side
 
+NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
+IN_IMAGES, IN_LIDAR, IN_LEFT, IN_RIGHT = 1, 2, 4, 8  # where an object is: bits
+LEFT_VIEW, RIGHT_VIEW = IN_IMAGES | IN_LEFT, IN_IMAGES | IN_RIGHT  # bits that an image shows
+ANY_VIEW = LEFT_VIEW | RIGHT_VIEW
+FIRST_PATCH = -2  # object number of patch 0; patch n has FIRST_PATCH - n
+CELL_M = 8.0
+REACH_CELLS = 16  # no object is so high that a ray passes over more cells beside it
+SAME_M = 0.01  # off a patch's plane: of the same roof
+CLOSE_M = 1e-3  # a step of Newton's method below which the next, its square, is none
+LIDAR_LEAN = 0.27  # greatest tangent of a LiDAR pulse off the vertical
+
 
 @inlined
 def patch_top(s, i, j, ax, ay, bx, by, low, high):
@@ -80,18 +91,6 @@ def greatest(patches: np.ndarray) -> np.ndarray:
     """Greatest z of each patch, [rows, cols]."""
     slopes = np.abs(patches[..., 1]) + np.abs(patches[..., 2])
     return patches[..., 0] + PATCH_M / 2 * slopes
-
-
-NONE, GROUND, ROOF, WALL, TREE, WATER = range(6)
-IN_IMAGES, IN_LIDAR, IN_LEFT, IN_RIGHT = 1, 2, 4, 8  # where an object is: bits
-LEFT_VIEW, RIGHT_VIEW = IN_IMAGES | IN_LEFT, IN_IMAGES | IN_RIGHT  # bits that an image shows
-ANY_VIEW = LEFT_VIEW | RIGHT_VIEW
-FIRST_PATCH = -2  # object number of patch 0; patch n has FIRST_PATCH - n
-CELL_M = 8.0
-REACH_CELLS = 16  # no object is so high that a ray passes over more cells beside it
-SAME_M = 0.01  # off a patch's plane: of the same roof
-CLOSE_M = 1e-3  # a step of Newton's method below which the next, its square, is none
-LIDAR_LEAN = 0.27  # greatest tangent of a LiDAR pulse off the vertical
 
 
 class Surfaces(NamedTuple):

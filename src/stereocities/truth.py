@@ -41,9 +41,7 @@ from .world import world_of
 if TYPE_CHECKING:
     import xarray as xr
 
-
 log = logging.getLogger("stereotruth")
-
 
 CHUNK = 512
 SEEN_TOLERANCE_M = 0.02
@@ -74,6 +72,15 @@ LAYERS = {
 }
 FLAGS = {"surface": SURFACES, "changed": CHANGES}
 REALS = [name for name, (dtype, _, _) in LAYERS.items() if dtype == "float64"]
+
+UNCHANGED, BUILT, DEMOLISHED, GROWN_OR_FELLED, MOVED, WATER_LEVEL, GROUND_LEVEL, TEXTURE = range(8)
+CHANGE_LAYERS = {
+    "height": "m above the frame's height: what the pixel's ray meets in the image's world",
+    "height_other": "m: what it meets in the world of the other image",
+    "height_lidar": "m: what it meets in the world of the LiDAR",
+    "reason": "what changed there: one of REASONS",
+}
+REASONS = "none built demolished grown_or_felled moved water ground texture"
 
 
 @inlined
@@ -247,16 +254,6 @@ def open_truth(path: str | Path) -> xr.Dataset:
     import xarray as xr  # a quarter of a job's start-up, and the job that makes it needs none
 
     return xr.open_zarr(path, consolidated=True, chunks=None)
-
-
-UNCHANGED, BUILT, DEMOLISHED, GROWN_OR_FELLED, MOVED, WATER_LEVEL, GROUND_LEVEL, TEXTURE = range(8)
-CHANGE_LAYERS = {
-    "height": "m above the frame's height: what the pixel's ray meets in the image's world",
-    "height_other": "m: what it meets in the world of the other image",
-    "height_lidar": "m: what it meets in the world of the LiDAR",
-    "reason": "what changed there: one of REASONS",
-}
-REASONS = "none built demolished grown_or_felled moved water ground texture"
 
 
 @inlined

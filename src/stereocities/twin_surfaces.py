@@ -40,6 +40,29 @@ SEAM_M = 0.35  # planes that come so near each other meet in a ridge or a valley
 SEAM = 3  # patches to each side, among which such a plane is sought
 SIDE_M = 1.0  # over which the directions of sides are smoothed
 
+GROUND_CLASSES = (2, 9)
+STEP_M = 2.0  # between the coefficients of the spline
+FILTER_M = 1.0  # cells in which the lowest points are sought
+WIDEST_M = 30.0  # half the width of the widest building, where no class tells the ground
+STEEP = 0.15  # rise over run of ground that the search for objects lets pass
+LOW_M = 3.0  # a cell so far below those around has a false point
+NEAR_M = 0.5  # of the lowest surface: ground
+BEYOND = 64  # squares of ground that tell how high it lies where the file ends
+MAX_SLOPE = 1.0  # less steep than any ray, so that each meets the ground once
+
+CLASSES = (3, 4, 5)
+ROOFS = (6, 17)  # 17: bridge decks
+OBJECT_M = 1.5  # above the ground: less is none
+ROUGH_M = 0.2  # rms of neighbours off their plane: more is no roof
+SEVERAL = 0.6  # share of the neighbours whose pulses had more returns: more is no roof
+SPACING_M = 1.2  # between tops
+TREE_M = 6.0  # between trees
+RADIUS_M = (1.0, 1.35)
+DEPTH_M = 5.0  # of a crown below its top at most
+BOTTOM = 0.3  # of a top's height above the ground
+LEAF = 0.15  # reflectance of a leaf of style 1
+POROSITY = 0.3  # share of the pulses that the top of a crown lets pass
+
 
 class Points(NamedTuple):
     """Points of a place: ``xyz`` float64[n, 3] in the world frame; ``label`` uint8[n]: class of
@@ -346,17 +369,6 @@ def _sides(z: np.ndarray) -> np.ndarray:
     return np.rint(np.arctan2(down_y, down_x) * (128 / math.pi)).astype(np.int64).astype(np.uint8)
 
 
-GROUND_CLASSES = (2, 9)
-STEP_M = 2.0  # between the coefficients of the spline
-FILTER_M = 1.0  # cells in which the lowest points are sought
-WIDEST_M = 30.0  # half the width of the widest building, where no class tells the ground
-STEEP = 0.15  # rise over run of ground that the search for objects lets pass
-LOW_M = 3.0  # a cell so far below those around has a false point
-NEAR_M = 0.5  # of the lowest surface: ground
-BEYOND = 64  # squares of ground that tell how high it lies where the file ends
-MAX_SLOPE = 1.0  # less steep than any ray, so that each meets the ground once
-
-
 def is_ground(points: Points) -> np.ndarray:
     """Which points lie on the ground, bool[n]: by their class, or else the lowest ones.
 
@@ -432,20 +444,6 @@ def _less_steep(z: np.ndarray) -> np.ndarray:
         if np.array_equal(lower, z):
             return z
         z = lower
-
-
-CLASSES = (3, 4, 5)
-ROOFS = (6, 17)  # 17: bridge decks
-OBJECT_M = 1.5  # above the ground: less is none
-ROUGH_M = 0.2  # rms of neighbours off their plane: more is no roof
-SEVERAL = 0.6  # share of the neighbours whose pulses had more returns: more is no roof
-SPACING_M = 1.2  # between tops
-TREE_M = 6.0  # between trees
-RADIUS_M = (1.0, 1.35)
-DEPTH_M = 5.0  # of a crown below its top at most
-BOTTOM = 0.3  # of a top's height above the ground
-LEAF = 0.15  # reflectance of a leaf of style 1
-POROSITY = 0.3  # share of the pulses that the top of a crown lets pass
 
 
 def is_leaf(points: Points) -> np.ndarray:

@@ -48,6 +48,16 @@ MIDDLE = 0.25  # reflectance of a point of median intensity
 DARKEST, BRIGHTEST = 0.04, 0.75  # reflectance
 GIVE_CRS = "give the coordinate system of the points, as --crs EPSG:2154"
 
+MARGIN_PX = 30  # of the left image around the points
+MOST_PX = 3200  # a side of 2 km: the patches of a twin take some 4 GB while it is built
+SUN_DEG = (148.0, 54.0)
+# Land use is what the ground looks like where the file tells nothing of it; all else is the file's.
+CHARACTER = Character(
+    relief_m=0.0, valley=0.0, wavelength_m=0.0, max_slope_deg=0.0, river_m=0.0, lakes=0.0,
+    zones={"slabs": 2.0, "lowrise": 2.0, "village": 1.0, "park": 1.5}, towers_m=(0.0, 0.0),
+    trees=0.0, zone_m=200.0,
+)  # fmt: skip
+
 
 class Extent(NamedTuple):
     """Where the points of a file lie: ``crs`` of their plan positions, ``low`` and ``high`` [3] in
@@ -206,17 +216,6 @@ def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, Crowns]:
         patch_j=int(first[1]), paint=np.rint(raster.paint * PAINT).astype(np.uint16),
     )  # fmt: skip
     return s, crowns
-
-
-MARGIN_PX = 30  # of the left image around the points
-MOST_PX = 3200  # a side of 2 km: the patches of a twin take some 4 GB while it is built
-SUN_DEG = (148.0, 54.0)
-# Land use is what the ground looks like where the file tells nothing of it; all else is the file's.
-CHARACTER = Character(
-    relief_m=0.0, valley=0.0, wavelength_m=0.0, max_slope_deg=0.0, river_m=0.0, lakes=0.0,
-    zones={"slabs": 2.0, "lowrise": 2.0, "village": 1.0, "park": 1.5}, towers_m=(0.0, 0.0),
-    trees=0.0, zone_m=200.0,
-)  # fmt: skip
 
 
 def twin_city(

@@ -51,6 +51,16 @@ from .surfaces import (
     terrain_heights,
 )
 
+PASSES = 2  # up is the ellipsoid's normal at the city's centre: the place follows from the height
+
+log = logging.getLogger("stereotruth")
+
+WORLDS = {"left": IN_LEFT, "right": IN_RIGHT, "lidar": IN_LIDAR}
+STOREYS_M = (3.0, 15.0)  # least and greatest height by which a building is raised
+CROP_M = (1.2, 3.0)  # by which a crop is higher than another
+YOUNG = 0.45  # size of a crown before it has grown, over its size then
+EDGE_M = 4.0  # of a field's block, where its crop ends
+
 
 def write_surfaces(city: CitySpec, out_npz: str | Path) -> None:
     """Build a city and write its surfaces: one array per field of :class:`.surfaces.Surfaces`."""
@@ -76,9 +86,6 @@ def _surfaces_of(city: CitySpec, built: Path | None) -> Surfaces:
         return Surfaces(**{
             name: fields[name] if fields[name].ndim else fields[name].item() for name in fields
         })  # fmt: skip
-
-
-PASSES = 2  # up is the ellipsoid's normal at the city's centre: the place follows from the height
 
 
 @kernel
@@ -109,9 +116,6 @@ def top_surface(
         height = frame.to_geodetic(xyz)[:, 2]
     height[kind == 0] = np.nan
     return height.reshape(lon.shape), kind.reshape(lon.shape)
-
-
-log = logging.getLogger("stereotruth")
 
 
 def _cells(half: np.ndarray, xy: np.ndarray, s: Surfaces) -> tuple[np.ndarray, np.ndarray]:
@@ -259,13 +263,6 @@ def _standing(city: CitySpec, s: Surfaces, boxes: Objects, trees: Objects) -> Su
         s.terrain.max() + city.base_height_m,
     )  # fmt: skip
     return s
-
-
-WORLDS = {"left": IN_LEFT, "right": IN_RIGHT, "lidar": IN_LIDAR}
-STOREYS_M = (3.0, 15.0)  # least and greatest height by which a building is raised
-CROP_M = (1.2, 3.0)  # by which a crop is higher than another
-YOUNG = 0.45  # size of a crown before it has grown, over its size then
-EDGE_M = 4.0  # of a field's block, where its crop ends
 
 
 def _moments(city: CitySpec, moment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -39,6 +39,34 @@ FILLED = 0.6  # where so many carry it
 AS_STATED, SIGN = "as stated", "opposite sign"
 SWAPPED, SWAPPED_SIGN = "images swapped", "on the right image"
 
+# Contradiction.
+SCAN_STEP_PX = 10  # between the labels that are tried
+HALF = 6  # px: windows of 13 x 13
+MIN_SUPPORT = 70  # pixels of the surface in the window
+NEAR_PX = 1  # the label is right to this
+APART_PX = 3  # from here on it is elsewhere
+REACH_PX = 64
+MARGIN = 0.2  # of correlation, by which elsewhere must be better,
+CLEAR = 0.8  # and good
+DECOY_ROWS = (29, -37, 43, -51)  # in turn
+
+# Hidden pixels.
+FOLD_PX = 1.0  # labels that are right to some tenths of a px fold by less
+WINDOW = 9  # px
+IN_FRONT = 0.15  # of correlation: crowns fold, too, and what lies below them is seen as well
+LARGER, SMALLER = "larger", "smaller"
+
+# Registration.
+HEIGHT_STEP_PX = 1.5  # of labels within AROUND_STEP_PX of a pixel
+AROUND_STEP_PX = 3
+FARTHEST_PX = 3
+MIN_PIXELS = 2000
+MOVES = [
+    (x, y)
+    for far in range(1, FARTHEST_PX + 1)
+    for x, y in ((far, 0), (-far, 0), (0, far), (0, -far))
+]
+
 
 class Values(NamedTuple):
     """Facts of a label file. Shares are of all pixels; ``outside`` of the labelled ones.
@@ -142,16 +170,6 @@ def swapped(matches: Matches) -> Matches:
 
 # ------------------------------------------------------------------------------- contradiction
 
-SCAN_STEP_PX = 10  # between the labels that are tried
-HALF = 6  # px: windows of 13 x 13
-MIN_SUPPORT = 70  # pixels of the surface in the window
-NEAR_PX = 1  # the label is right to this
-APART_PX = 3  # from here on it is elsewhere
-REACH_PX = 64
-MARGIN = 0.2  # of correlation, by which elsewhere must be better,
-CLEAR = 0.8  # and good
-DECOY_ROWS = (29, -37, 43, -51)  # in turn
-
 
 class Scan(NamedTuple):
     """n labels that were tried: pixel ``x``, ``y``; correlations, NaN where there is no peak.
@@ -236,11 +254,6 @@ def scan_labels(left: Picture, right: Picture, labels: Labels, reach: tuple[floa
 
 # ------------------------------------------------------------------------------- hidden pixels
 
-FOLD_PX = 1.0  # labels that are right to some tenths of a px fold by less
-WINDOW = 9  # px
-IN_FRONT = 0.15  # of correlation: crowns fold, too, and what lies below them is seen as well
-LARGER, SMALLER = "larger", "smaller"
-
 
 def hidden_labels(labels: Labels, nearer: str = LARGER) -> Bools:
     """Labels that others of their row hide from the right view, by the labels' own geometry.
@@ -281,16 +294,6 @@ def who_is_in_front(left: Picture, right: Picture, labels: Labels) -> Estimate:
 
 
 # -------------------------------------------------------------------------------- registration
-
-HEIGHT_STEP_PX = 1.5  # of labels within AROUND_STEP_PX of a pixel
-AROUND_STEP_PX = 3
-FARTHEST_PX = 3
-MIN_PIXELS = 2000
-MOVES = [
-    (x, y)
-    for far in range(1, FARTHEST_PX + 1)
-    for x, y in ((far, 0), (-far, 0), (0, far), (0, -far))
-]
 
 
 def better_place(left: Picture, right: Picture, labels: Labels) -> tuple[tuple[int, int], Estimate]:

@@ -43,7 +43,6 @@ from stereotruth.tiles import sift_matches
 Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
-
 SMOOTHING_PX = 0.7  # standard deviation: what is left aliases by less than 0.01 px
 HALF = 8  # px: windows of 17 x 17,
 WEIGHT_PX = 4.5  # weighted by a Gaussian of this standard deviation
@@ -58,6 +57,19 @@ LABELLED = 0.6  # of a window, by weight, where labels are held against a match
 ROW_STEP_PX = 9.0  # of the search for rows that are far off: SIFT looks 5 px up and down
 ROW_STEPS = 4
 FEW = 30  # key points matched: fewer, and other rows are tried
+
+# Shared ground.
+FEATURES = 800  # of an image, the strongest
+COMPONENTS = 14
+QUERIES = 200  # of them, evenly chosen, are looked up
+NEIGHBOURS = 6  # of a feature, in other images
+AXES_FROM = 100_000  # features, evenly chosen, that the principal components are taken of
+COMPARED = 60  # images: so few are all compared with each other; of more those with more neighbours
+UNLIKELY = 4.0  # than by chance, by so many standard deviations
+RATIO = 0.85
+REPROJECTION_PX = 3.0
+MIN_INLIERS = 8
+SCALE = 1.3
 
 
 class Matches(NamedTuple):
@@ -306,18 +318,6 @@ def match_pair(
 
 
 # ------------------------------------------------------------------------------- shared ground
-
-FEATURES = 800  # of an image, the strongest
-COMPONENTS = 14
-QUERIES = 200  # of them, evenly chosen, are looked up
-NEIGHBOURS = 6  # of a feature, in other images
-AXES_FROM = 100_000  # features, evenly chosen, that the principal components are taken of
-COMPARED = 60  # images: so few are all compared with each other; of more those with more neighbours
-UNLIKELY = 4.0  # than by chance, by so many standard deviations
-RATIO = 0.85
-REPROJECTION_PX = 3.0
-MIN_INLIERS = 8
-SCALE = 1.3
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,6 +50,33 @@ TO_EDGES = {
     "tilt_y": ", from the middle to the lower edge",
 }
 
+# A dataset.
+NONE = "none"
+CONFIDENCE = 0.05  # of all limits that are stated
+RESAMPLES = 2000
+FEW = 8  # pairs: fewer give no limits of their mean
+POOLED = {  # figure: where it stands, as an estimate or a number
+    "parallax_px": ("rows", "parallax"),
+    "parallax_tilt_x_px": ("rows", "tilt_x"),
+    "parallax_tilt_y_px": ("rows", "tilt_y"),
+    "label_bias_px": ("bias", "bias"),
+    "label_bias_tilt_x_px": ("bias", "tilt_x"),
+    "label_bias_tilt_y_px": ("bias", "tilt_y"),
+    "contradicted_share": ("contradicted", "share"),
+}
+PLAIN = {
+    "parallax_spread_px": ("rows", "spread"),
+    "off_row_share": ("rows", "off_row"),
+    "label_spread_px": ("bias", "spread"),
+    "gross_share": ("bias", "gross"),
+    "poor_correlation_share": ("contradicted", "poor"),
+    "hidden_share": ("hidden", "share"),
+    "labelled_share": ("labels", "labelled"),
+    "label_min_px": ("labels", "low"),
+    "label_max_px": ("labels", "high"),
+    "outside_share": ("labels", "outside"),
+}
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -191,32 +218,6 @@ def _values(figures: Figures, level: float) -> list[Finding]:
 
 
 # ----------------------------------------------------------------------------------- a dataset
-
-NONE = "none"
-CONFIDENCE = 0.05  # of all limits that are stated
-RESAMPLES = 2000
-FEW = 8  # pairs: fewer give no limits of their mean
-POOLED = {  # figure: where it stands, as an estimate or a number
-    "parallax_px": ("rows", "parallax"),
-    "parallax_tilt_x_px": ("rows", "tilt_x"),
-    "parallax_tilt_y_px": ("rows", "tilt_y"),
-    "label_bias_px": ("bias", "bias"),
-    "label_bias_tilt_x_px": ("bias", "tilt_x"),
-    "label_bias_tilt_y_px": ("bias", "tilt_y"),
-    "contradicted_share": ("contradicted", "share"),
-}
-PLAIN = {
-    "parallax_spread_px": ("rows", "spread"),
-    "off_row_share": ("rows", "off_row"),
-    "label_spread_px": ("bias", "spread"),
-    "gross_share": ("bias", "gross"),
-    "poor_correlation_share": ("contradicted", "poor"),
-    "hidden_share": ("hidden", "share"),
-    "labelled_share": ("labels", "labelled"),
-    "label_min_px": ("labels", "low"),
-    "label_max_px": ("labels", "high"),
-    "outside_share": ("labels", "outside"),
-}
 
 
 def bootstrap(values: Sequence[float | None]) -> dict[str, Any]:

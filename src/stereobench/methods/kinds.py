@@ -27,6 +27,15 @@ from stereotruth.core.errors import InputError, install_extra
 
 IMPORTERS = ("import_module", "__import__", "spec_from_file_location", "run_path", "run_module")
 
+FOLDER = "folder"
+# keys of an entry that change no result
+TOLD = ("label", "fine_tuned_of", "licence", "version", "trained_on")
+MOVED = ("polarity", "outside")  # of any kind
+ENTRY_POINTS = "stereotruth.methods"
+MCCNN = "mccnn"  # the pipeline of Pandora that has this name in the place of a file
+MCCNN_MODULES = ("mc_cnn", "pandora_plugin_mc_cnn", "torch")
+Files = Callable[[Mapping[str, Any]], list[Path]]
+
 
 def _names(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Modules that are imported anywhere in a file: dots before the name, and the name."""
@@ -80,16 +89,6 @@ def imported_files(files: Iterable[Path]) -> list[Path]:
             places = [own] if level else [own, Path(), *named]
             todo += _files_of(name, places)
     return sorted(found.values())
-
-
-FOLDER = "folder"
-# keys of an entry that change no result
-TOLD = ("label", "fine_tuned_of", "licence", "version", "trained_on")
-MOVED = ("polarity", "outside")  # of any kind
-ENTRY_POINTS = "stereotruth.methods"
-MCCNN = "mccnn"  # the pipeline of Pandora that has this name in the place of a file
-MCCNN_MODULES = ("mc_cnn", "pandora_plugin_mc_cnn", "torch")
-Files = Callable[[Mapping[str, Any]], list[Path]]
 
 
 def _none(settings: Mapping[str, Any]) -> list[Path]:

@@ -13,6 +13,8 @@ from stereotruth.core.errors import InputError
 
 DisparityRange = tuple[int, int]
 
+WINDOW_PX = 5
+
 
 @runtime_checkable
 class Matcher(Protocol):
@@ -112,9 +114,6 @@ def called(name: str, make: Callable[..., Matcher], settings: Mapping[str, Any])
             remedy="config/README.md lists the settings of each kind",
         ) from error
     return make(**settings)
-
-
-WINDOW_PX = 5
 
 
 def spread(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -41,10 +41,22 @@ log = logging.getLogger("stereotruth")
 Place = tuple[int, int]
 Window = tuple[slice, slice]
 
-
 BLOCK_PX = 1024
 OVERLAP_PX = 64
 PHASE_PX = 64  # parts begin at multiples: networks, on reduced grids, see all tiles in one phase
+
+Disparities = NDArray[np.float32]
+
+CELL_PX = 32
+LARGEST_BIAS_PX = 8.0  # between tiles; what differs by more on the whole is left as it is
+SAME_PX, OTHER_PX = 2.0, 4.0
+
+REDUCED_PX = 2048  # longest side of the reduced images
+MEDIAN = 5  # px, reduced
+MIN_VALUES = 9  # reduced pixels with a disparity that a block must have
+MIN_SHARE = 0.05  # of its reduced pixels that have an image
+RESERVE_PX = 8  # kept free at both ends of the range: what the reduced scene does not show
+NEARLY = 0.998  # of the most values in range are as good as most
 
 
 @dataclass(frozen=True)
@@ -134,14 +146,6 @@ def view_of(
             slice(max(cols.start, 0) - first, min(cols.stop, shape[1]) - first),
         ),
     )
-
-
-Disparities = NDArray[np.float32]
-
-
-CELL_PX = 32
-LARGEST_BIAS_PX = 8.0  # between tiles; what differs by more on the whole is left as it is
-SAME_PX, OTHER_PX = 2.0, 4.0
 
 
 def _part(image: Any, window: Window) -> NDArray[Any]:
@@ -276,14 +280,6 @@ def blend(tiling: Tiling, place: Place, tiles: Mapping[Place, Any]) -> Dispariti
             weight = in_rows[r, None] * in_cols[None, c]
             change[r, c] += weight * (bias[at] + np.nan_to_num(same * rest))
     return (own + change).astype(np.float32)
-
-
-REDUCED_PX = 2048  # longest side of the reduced images
-MEDIAN = 5  # px, reduced
-MIN_VALUES = 9  # reduced pixels with a disparity that a block must have
-MIN_SHARE = 0.05  # of its reduced pixels that have an image
-RESERVE_PX = 8  # kept free at both ends of the range: what the reduced scene does not show
-NEARLY = 0.998  # of the most values in range are as good as most
 
 
 @dataclass(frozen=True, eq=False)

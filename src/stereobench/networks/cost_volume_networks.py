@@ -34,6 +34,12 @@ SLOPE, REFINER_SLOPE = 0.2, 0.3  # of leaky ReLUs
 STEREONET_CHANNELS = 32
 DILATIONS = (1, 2, 4, 8, 1, 1)
 
+PSMNET_CHANNELS = 32
+POOLS = (64, 32, 16, 8)  # sides of the averaged squares, in pixels of the features
+
+HMSMNET_CHANNELS = 16
+SCALES = (4, 8, 16)
+
 
 class StereoNetFeatures(nn.Sequential):
     """[N, C, H, W] images -> [N, 32, H / 8, W / 8]."""
@@ -126,10 +132,6 @@ class StereoNet(nn.Module):
             return [disparity.squeeze(1)]
         full = [resize(d, size) * (size[0] / d.shape[2]) for d in found[:-1]]
         return [d.squeeze(1) for d in (*full, disparity)]
-
-
-PSMNET_CHANNELS = 32
-POOLS = (64, 32, 16, 8)  # sides of the averaged squares, in pixels of the features
 
 
 def _conv2d(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
@@ -238,10 +240,6 @@ class PSMNet(nn.Module):
         """
         disparity = self.expected(cost, 4 * self.planes[0] + 1.5, 4.0)
         return F.interpolate(disparity.unsqueeze(1), scale_factor=4.0, mode="nearest").squeeze(1)
-
-
-HMSMNET_CHANNELS = 16
-SCALES = (4, 8, 16)
 
 
 class HMSMNetFeatures(nn.Module):

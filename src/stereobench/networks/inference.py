@@ -37,6 +37,9 @@ from .weights import (
 
 log = logging.getLogger("stereotruth")
 
+UNCERTAINTIES = (None, "entropy", "flips")
+PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
 
 def padding(height: int, width: int, divisor: int) -> tuple[int, int]:
     """Rows and columns to add so that both sides are multiples of ``divisor``."""
@@ -55,10 +58,6 @@ def choose_device(wanted: str | None) -> torch.device:
         raise InputError(
             f"device {name}: {str(error).splitlines()[0]}", remedy="set device to null, or cpu"
         ) from error
-
-
-UNCERTAINTIES = (None, "entropy", "flips")
-PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
 
 def precision_of(wanted: str | None, device: torch.device) -> str:

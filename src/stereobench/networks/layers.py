@@ -20,6 +20,10 @@ from torch import Tensor, nn
 
 CHANNELS = 16  # from here on, in and out, products of matrices are faster
 
+EPSILON, MOMENTUM = 1e-3, 0.01  # of batch normalisation
+TRAINED = (nn.Conv2d, nn.Conv3d, nn.ConvTranspose2d, nn.ConvTranspose3d, nn.Linear)  # kernels
+SMALL = 20480  # channels x planes x rows; see _is_slow
+
 
 def convolve(x: Tensor, kernel: Tensor, bias: Tensor | None, dilation: int) -> Tensor:
     """[N, C, H, W] -> [N, C', H, W]: stride 1, "same" padding, odd square kernel [C', C, k, k]."""
@@ -90,11 +94,6 @@ def kernel_gradient(x: Tensor, gradient: Tensor, side: int, dilation: int) -> Te
             for a, b in zip(moved, pixels):
                 found[i, j] += torch.bmm(a[there].transpose(1, 2), b[here]).sum(0)
     return found.permute(3, 2, 0, 1)
-
-
-EPSILON, MOMENTUM = 1e-3, 0.01  # of batch normalisation
-TRAINED = (nn.Conv2d, nn.Conv3d, nn.ConvTranspose2d, nn.ConvTranspose3d, nn.Linear)  # kernels
-SMALL = 20480  # channels x planes x rows; see _is_slow
 
 
 class Conv2d(nn.Conv2d):

@@ -46,6 +46,8 @@ from .training_state import (
 )
 from .weights import SavedNetwork, save_weights
 
+log = logging.getLogger("stereotruth")
+
 
 def loss_of(outputs: Sequence[Tensor], disparity: Tensor, weights: Sequence[float]) -> Tensor:
     """Weighted sum over the outputs of the mean smooth L1 over labelled pixels.
@@ -68,9 +70,6 @@ def loss_of(outputs: Sequence[Tensor], disparity: Tensor, weights: Sequence[floa
             error = F.smooth_l1_loss(output.float()[where], target[where])
             total = total + weight * error
     return total
-
-
-log = logging.getLogger("stereotruth")
 
 
 def train(

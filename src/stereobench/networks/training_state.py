@@ -31,6 +31,12 @@ from .inference import load_network
 from .training_pairs import LabelledPairs
 from .weights import SavedNetwork, covering, load_weights, save_weights, scaling_of
 
+log = logging.getLogger("stereotruth")
+FORMAT = 1  # of the state
+BETAS = (0.9, 0.999)
+
+CURVE = ("epoch", "step", "learning_rate", "loss", "val_epe_px", "val_d1", "seconds")
+
 
 class TrainingSettings(Training):
     """How a network is trained, with what does not stand in the section training."""
@@ -46,11 +52,6 @@ class TrainingSettings(Training):
         """What the weights follow from: all but how long and where the work is done."""
         left_out = ("epochs", "hours", "threads", "loader_workers", "checkpoint_minutes", "device")
         return self.model_dump(exclude=set(left_out))
-
-
-log = logging.getLogger("stereotruth")
-FORMAT = 1  # of the state
-BETAS = (0.9, 0.999)
 
 
 @dataclass
@@ -184,9 +185,6 @@ def save_state(path: Path, record: Mapping[str, Any]) -> None:
         torch.save(dict(record), scratch)
         with scratch.open("rb") as stream:
             os.fsync(stream.fileno())
-
-
-CURVE = ("epoch", "step", "learning_rate", "loss", "val_epe_px", "val_d1", "seconds")
 
 
 def publish_training(job: TrainingJob, provenance: dict[str, Any]) -> dict[str, Any]:

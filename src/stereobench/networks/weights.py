@@ -34,6 +34,12 @@ from .layers import TRAINED
 SAMPLES = 1 << 22  # pixels that a quantile is taken from
 GREY = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
 
+Arrays = list[NDArray[np.float32]]
+MOST_BYTES = 2 << 30  # of all arrays of a file, as they are in memory
+MOST_NAMES = 20_000  # of layers and arrays
+DEEPEST = 20  # groups in each other
+REMEDY = "name an .h5 file that Keras has saved (weights or model), from somebody whom you trust"
+
 
 class Scaling(NamedTuple):
     """What the blocks of both images must share, see :func:`image_statistics`."""
@@ -187,13 +193,6 @@ def covering(kind: str, wanted: tuple[int, int]) -> tuple[int, int]:
     first = wanted[0] // of.plane_px * of.plane_px
     step = of.plane_px * of.planes_divisor
     return first, first + -(-(wanted[1] - first) // step) * step
-
-
-Arrays = list[NDArray[np.float32]]
-MOST_BYTES = 2 << 30  # of all arrays of a file, as they are in memory
-MOST_NAMES = 20_000  # of layers and arrays
-DEEPEST = 20  # groups in each other
-REMEDY = "name an .h5 file that Keras has saved (weights or model), from somebody whom you trust"
 
 
 def read_weights(path: str | Path) -> list[Arrays]:

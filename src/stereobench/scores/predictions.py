@@ -49,8 +49,13 @@ from .prediction_files import RECORD, SUBMITTED, UNCERTAINTY, Submission
 
 MB = 1 << 20
 
-
 Took = dict[str, float | None]  # of a pair: seconds (None: not run here), peak memory_mb
+
+# What a method is.
+GIB = 1 << 30
+INSTALLED = {"sgm": ["cv2"], "pandora": ["pandora"]}  # packages that kinds are made of,
+OF_PIPELINE = {MCCNN: ["mc_cnn"]}  # and pipelines of Pandora
+LICENCES = {"pandora": "Apache License 2.0"}  # of distributions whose files do not state it
 
 
 def predict(
@@ -288,11 +293,6 @@ def peak_memory_mb() -> float:
 
 
 # ---------------------------------------------------------------------------- what a method is
-
-GIB = 1 << 30
-INSTALLED = {"sgm": ["cv2"], "pandora": ["pandora"]}  # packages that kinds are made of,
-OF_PIPELINE = {MCCNN: ["mc_cnn"]}  # and pipelines of Pandora
-LICENCES = {"pandora": "Apache License 2.0"}  # of distributions whose files do not state it
 
 
 def identity(

@@ -23,10 +23,15 @@ Bools = NDArray[np.bool_]
 Disparity = NDArray[np.float32]  # [h, w] px, NaN: none
 Floats = NDArray[np.float64]
 
-
 ALL = "all"
 MIN_TILES = 5
 CONFIDENCE = (2.5, 97.5)  # percent
+
+LIMITS_PX = (*np.arange(5, 100, 5) / 100, *np.arange(10, 50) / 10, *np.arange(10, 41) / 2)
+
+TURNED = 0.5  # EPE of −d to that of d, below which the sign is in doubt
+OUTSIDE_SHARE = 0.01  # of the values
+ONE_VALUE_SHARE = 0.5  # of the values outside the range, that are one and the same
 
 
 @dataclass
@@ -195,9 +200,6 @@ def _along_rows(disparity: Disparity) -> Disparity:
     return np.take_along_axis(disparity, last, axis=1)
 
 
-LIMITS_PX = (*np.arange(5, 100, 5) / 100, *np.arange(10, 50) / 10, *np.arange(10, 41) / 2)
-
-
 class Cumulative:
     """Counts of absolute errors in px, to which tiles are added: pixels below many limits.
 
@@ -221,11 +223,6 @@ class Cumulative:
             {"error_px": float(limit), "share": round(float(share), 6)}
             for limit, share in zip(self.limits, shares)
         ]
-
-
-TURNED = 0.5  # EPE of −d to that of d, below which the sign is in doubt
-OUTSIDE_SHARE = 0.01  # of the values
-ONE_VALUE_SHARE = 0.5  # of the values outside the range, that are one and the same
 
 
 @dataclass

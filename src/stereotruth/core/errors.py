@@ -18,6 +18,21 @@ PAIR = re.compile(
 )
 HIDDEN = "…"
 
+FULL = (errno.ENOSPC, errno.EDQUOT)
+REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
+GONE = (errno.ENOENT, errno.ENOTDIR)
+SYSTEM = {
+    FULL: (
+        "no space left on the disk",
+        "make space there, and run again: what is done is kept (new files need inodes: df -i)",
+    ),
+    REFUSED: ("no permission", "get the right to it (ls -l), and run again"),
+    GONE: (
+        "no such file: it was there, and was taken away",
+        "put it back, or run again: what is missing of the products is made again",
+    ),
+}
+
 
 def without_secrets(text: str) -> str:
     """A text whose URLs have no name, password, query or fragment, so no signature and no token."""
@@ -68,22 +83,6 @@ def _name(file: str) -> str:
     """A file or URL as messages call it; a URL may hold blanks."""
     scheme, slashes, rest = re.split(r"(:/+)", file, maxsplit=1) if ":/" in file else (file, "", "")
     return scheme + slashes + _shown(rest) if slashes else file
-
-
-FULL = (errno.ENOSPC, errno.EDQUOT)
-REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS)
-GONE = (errno.ENOENT, errno.ENOTDIR)
-SYSTEM = {
-    FULL: (
-        "no space left on the disk",
-        "make space there, and run again: what is done is kept (new files need inodes: df -i)",
-    ),
-    REFUSED: ("no permission", "get the right to it (ls -l), and run again"),
-    GONE: (
-        "no such file: it was there, and was taken away",
-        "put it back, or run again: what is missing of the products is made again",
-    ),
-}
 
 
 def told_by_system(error: BaseException | None) -> InputError | None:

@@ -34,17 +34,6 @@ _IMPORT = re.compile(  # at the start of a line: what a function imports, no ker
     r"^(?:from\s+([.\w]+)\s+import\s+(\([^)]*\)|[^\n]*)|import\s+([^\n]+))", re.MULTILINE
 )
 
-
-def kernel(function: Callable) -> Callable:
-    """A compiled loop over points or pixels, which Python calls."""
-    named = config.CACHE_DIR
-    config.CACHE_DIR = str(folder() / sources_digest(function.__module__))
-    try:
-        return njit(nogil=True, cache=True, **_OPTIONS)(function)
-    finally:
-        config.CACHE_DIR = named
-
-
 inner: Callable = register_jitable(**_OPTIONS)
 """A function that kernels call; plain Python where Python calls it.
 
@@ -57,6 +46,16 @@ inlined: Callable = register_jitable(forceinline=True, _nrt=False, **_OPTIONS)
 Without reference counting of the arrays that it looks at: counting took two thirds of the time of
 the simulator's rays (1000 against 290 ns a ray, textures and shadows included).
 """
+
+
+def kernel(function: Callable) -> Callable:
+    """A compiled loop over points or pixels, which Python calls."""
+    named = config.CACHE_DIR
+    config.CACHE_DIR = str(folder() / sources_digest(function.__module__))
+    try:
+        return njit(nogil=True, cache=True, **_OPTIONS)(function)
+    finally:
+        config.CACHE_DIR = named
 
 
 def source_modules(module: str) -> list[str]:

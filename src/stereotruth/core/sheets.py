@@ -39,6 +39,8 @@ LIDAR_SUFFIXES = (".las", ".laz")
 RASTER_SUFFIXES = (".tif", ".tiff")  # of surface models
 LIDAR_SEPARATOR = ";"
 
+FILES = ("left_image", "right_image", "gcps", "geoid", "left_mask", "right_mask")  # of a scene
+
 
 def _count(cell: str | int) -> int:
     if not re.fullmatch(r"[0-9]{1,9}", str(cell)):
@@ -348,9 +350,6 @@ def read_scenes(
         require_unique([cells["scene"] for _, cells in rows], "scene", path)
     wrong.refuse()
     return scenes
-
-
-FILES = ("left_image", "right_image", "gcps", "geoid", "left_mask", "right_mask")  # of a scene
 
 
 def require_files(scene: Scene, sheet: str | Path, columns: Iterable[str]) -> None:

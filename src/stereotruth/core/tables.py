@@ -19,6 +19,14 @@ from pathlib import Path
 
 from .errors import InputError, in_number
 
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+LONGEST_NUMBER = 60  # characters; a float64 has 17 digits
+
+MOST_BYTES = 20_000_000
+MOST_MISTAKES = 100  # that are told
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+_DECLARED = re.compile(r"#\s*(\w+)\s*[:=]\s*(.*)")
+
 
 def acquisition_time(text: str) -> datetime | date:
     """The time, UTC, or the date that a cell ``acquired`` names. ValueError says what is wrong."""
@@ -62,10 +70,6 @@ def epoch_year(text: str) -> float | None:
     return year
 
 
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-LONGEST_NUMBER = 60  # characters; a float64 has 17 digits
-
-
 def decimal_number(text: str) -> float:
     """The number that a word of text is, in ASCII digits with a point, as every program reads it.
 
@@ -74,12 +78,6 @@ def decimal_number(text: str) -> float:
     if len(text) > LONGEST_NUMBER or not _NUMBER.fullmatch(text):
         raise ValueError(f"{text[:40]!r} is no number")
     return float(text)
-
-
-MOST_BYTES = 20_000_000
-MOST_MISTAKES = 100  # that are told
-SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
-_DECLARED = re.compile(r"#\s*(\w+)\s*[:=]\s*(.*)")
 
 
 class SheetError(InputError):

@@ -38,6 +38,9 @@ BEND = 0.1
 BLOCK, REGISTER, TOGETHER = 256, 16, 3
 GAP = 8  # pixels that nobody wants and that end no run of wanted ones
 
+# [4, h, wide]: brightness of both images, and by how much it may differ; None: it may be anything.
+Bright = Singles | None
+
 
 @kernel
 def wanted_runs(wanted: Bools) -> Runs:
@@ -65,10 +68,6 @@ def wanted_runs(wanted: Bools) -> Runs:
 
 
 # ------------------------------------------------------------------ who belongs to a window
-
-
-# [4, h, wide]: brightness of both images, and by how much it may differ; None: it may be anything.
-Bright = Singles | None
 
 
 class Members(NamedTuple):

@@ -22,6 +22,11 @@ from .view_geometry import Pair
 
 GREATEST_COUNT = 65535  # of points of a pixel that is stored
 
+Singles = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+Shorts = NDArray[np.uint16]
+Block = tuple[slice, slice]
+
 
 def layers_of(
     labels: WindowLabels,
@@ -212,12 +217,6 @@ def _uncertainty(settings: LabelSettings) -> dict[str, str]:
             "do not contradict it"
         )
     return attributes
-
-
-Singles = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
-Shorts = NDArray[np.uint16]
-Block = tuple[slice, slice]
 
 
 class LidarLabels(NamedTuple):

@@ -47,6 +47,10 @@ from .window_points import Footprint, PointWindows, blocks_in_view
 
 log = logging.getLogger("stereotruth")
 
+Bools = NDArray[np.bool_]
+
+EDGE = 33  # places along each side of a frame
+
 
 @dataclass(frozen=True, eq=False)
 class SceneInputs:
@@ -282,11 +286,6 @@ def _taken(
     by_row = None if azimuth is None or elevation is None else (azimuth, elevation)
     lon_lat = float(rpc.long_off), float(rpc.lat_off)
     return by_sheet(delivery, acquisition_time(acquired) if acquired else None, by_row, lon_lat)
-
-
-Bools = NDArray[np.bool_]
-
-EDGE = 33  # places along each side of a frame
 
 
 def lidar_read(inputs: SceneInputs, model: EpipolarModel) -> dict[str, Any]:

@@ -34,10 +34,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-
 READ_POINTS = 1 << 20  # about as many are read at once
 MOST_POINTS = 2_000_000  # of a window whose surface is worked on at once
 BLOCK = 1 << 16  # points that go through the projection at once, while they are in the cache
+
+Bools = NDArray[np.bool_]
+
+SPARE_PX = 3.0  # for what is not linear in a square or between places of a block, and roundings
+# A pixel may see a surface that is extrapolated beyond its points: its position in the right image
+# lies up to this much farther off.
+EXTRAPOLATED_PX = 16.0
 
 
 class Footprint(NamedTuple):
@@ -257,14 +263,6 @@ class PointWindows:
             high = [max(q, int(values.max())) for q, values in zip(high, lattice)]
         projection = LocalProjection.of(self.model, low, high)
         return WindowGround(self.stores, strips, projection, surface)
-
-
-Bools = NDArray[np.bool_]
-
-SPARE_PX = 3.0  # for what is not linear in a square or between places of a block, and roundings
-# A pixel may see a surface that is extrapolated beyond its points: its position in the right image
-# lies up to this much farther off.
-EXTRAPOLATED_PX = 16.0
 
 
 @kernel

@@ -26,12 +26,14 @@ from ..core.products.files import atomic_file
 
 Picture = NDArray[np.uint8]
 
-
 DISPARITIES, DIFFERENCES, ERRORS = "viridis", "RdBu", "inferno"
 NO_VALUE = (226, 229, 233)
 SUN = np.array([-1.0, -1.0, 2.0**0.5]) / 2.0  # of a hillshade: the top left, 45 degrees high
 # Of methods, kinds and the like: apart for all eyes, with a contrast of 3:1 on white as on black
 SERIES = ("#4693fa", "#c68505", "#653bfd", "#59a090", "#8b5a2e", "#226c95")
+
+STOPS = 13  # of the colours of a scale in CSS
+QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the picture shrinks
 
 
 def stretch(
@@ -99,10 +101,6 @@ def save_figure(path: str | Path, figure: Figure, dpi: int = 110) -> None:
     bounds = "tight" if figure.get_layout_engine() is None else None
     with atomic_file(path) as scratch:
         figure.savefig(scratch, dpi=dpi, metadata={"Software": None}, bbox_inches=bounds)
-
-
-STOPS = 13  # of the colours of a scale in CSS
-QUALITIES = (82, 70, 55, 40, 25)  # of WebP; where the last does not fit, the picture shrinks
 
 
 def encode(picture: Picture, limit: int) -> str:

@@ -25,6 +25,12 @@ from .findings import Findings, Level
 
 MOST_POINTS = 6_000_000  # read and compared in seven seconds
 
+AT_ONCE = 8  # files of servers that are looked at
+NO_DATUM = (
+    "declares no vertical datum",
+    "if they are orthometric, set geoid to a grid of their datum for this scene",
+)
+
 
 def check_strips(surveyed: Sequence[SurveyedFile], scene: Scene, found: Findings) -> None:
     """Add what the strips of a scene's files are off.
@@ -66,13 +72,6 @@ def _compared(files: tuple[Path, ...], lidar_crs: str, geoid: str) -> str:
         for file, store in zip(files, stores):
             ingest(file, store, lidar_crs=lidar_crs or None, geoid=geoid or None)
         return compare_strips([PointStore(store) for store in stores]).sentence
-
-
-AT_ONCE = 8  # files of servers that are looked at
-NO_DATUM = (
-    "declares no vertical datum",
-    "if they are orthometric, set geoid to a grid of their datum for this scene",
-)
 
 
 def check_lidar(

@@ -42,9 +42,13 @@ NAMES = {  # column: what others call it
     },
 }
 
-
 NO_SYSTEM = "EPSG:4326"  # of degrees
 SYSTEM = ("crs", "wkt", "epsg", "frame")  # remarks that declare it, the first before others
+
+# QGIS.
+QGIS = "save the points by QGIS: mapX,mapY,sourceX,sourceY,enable"
+
+TABLES = (".csv", ".txt", ".tsv")
 
 
 @dataclass(frozen=True)
@@ -243,8 +247,6 @@ def _called(header: Sequence[str], columns: Sequence[str]) -> dict[str, str]:
 
 # ------------------------------------------------------------------------------------------- QGIS
 
-QGIS = "save the points by QGIS: mapX,mapY,sourceX,sourceY,enable"
-
 
 def from_qgis(
     files: Sequence[Path], crs: str = "", epoch: str = ""
@@ -417,9 +419,6 @@ def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, str], li
         ground = value["lon"], value["lat"], value.get("height", math.nan)
         points.append(Point(cells[called["id"]], *ground, *pixels))
     return points, _declared(table, crs), [f"{len(points)} points of {file.name}"]
-
-
-TABLES = (".csv", ".txt", ".tsv")
 
 
 def with_heights(points: Sequence[Point], ground: Sequence[Point], source: Path) -> list[Point]:

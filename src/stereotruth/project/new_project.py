@@ -31,6 +31,12 @@ scenes: scenes.tsv
 cities: cities.tsv
 """
 
+SHIPPED = {
+    "default": "how every run treats what is made and what is due; taken without being named",
+    "slurm": "each step as a job of a SLURM cluster",
+    "s3": "products in a bucket",
+}
+
 
 def configuration_text() -> str:
     """The text of a new config.yaml: keys with their defaults and remarks, commented out."""
@@ -83,13 +89,6 @@ def append_row(file: Path, cells: Mapping[str, object]) -> None:
 def city_row(name: str, prefix: str) -> dict[str, object]:
     """The row of a new city, whose tiles are split 6 : 1 : 3."""
     return {"city": name, "prefix": prefix, "training": 6, "validation": 1, "testing": 3}
-
-
-SHIPPED = {
-    "default": "how every run treats what is made and what is due; taken without being named",
-    "slurm": "each step as a job of a SLURM cluster",
-    "s3": "products in a bucket",
-}
 
 
 def list_profiles() -> list[str]:

@@ -39,6 +39,11 @@ INGESTED = Path("results/ingest")
 # What a pair takes from its city's other rows.
 OF_CITY = ("lidar", "lidar_crs", "lidar_epoch", "geoid", "gcps")
 
+COLUMNS = (
+    "", "left", "right", "bits/px", "matched", "m/px", "convergence", "bisector", "asymmetry",
+    "sun", "days", "shared", "pixels", "reason",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -210,12 +215,6 @@ def _free_name(pair: SitePair, scenes: dict[str, sheets.Scene]) -> str:
     name = re.sub(r"[^A-Za-z0-9-]", "-", f"{pair.left}-{pair.right}")[: sheets.LONGEST_NAME - 4]
     names = (name, *(f"{name}-{k}" for k in range(2, 1000)))
     return next(one for one in names if one not in scenes)
-
-
-COLUMNS = (
-    "", "left", "right", "bits/px", "matched", "m/px", "convergence", "bisector", "asymmetry",
-    "sun", "days", "shared", "pixels", "reason",
-)  # fmt: skip
 
 
 def table(

@@ -54,6 +54,9 @@ SHARED = Path("config") / CONFIG  # of a clone: the Snakefile reads it
 MOST_BYTES = 1_000_000  # of a configuration
 MOST_VALUES = 200_000
 
+LOOKED_AT = 10  # scenes of a city whose deliveries are looked into
+ANYWHERE = (0.0, 0.0)  # degrees: a day does not depend on the place
+
 
 def configured(files: Sequence[str | Path] | None = None) -> tuple[Configuration, str]:
     """The configuration of this folder as a run reads it, and the names of the files it is from.
@@ -455,10 +458,6 @@ def check_fixed(
                 remedy="take a scene of the sheet and the path of its alignment.json, or an image "
                 "of the images sheet and a copy of results/adjust/<city>.json",
             )
-
-
-LOOKED_AT = 10  # scenes of a city whose deliveries are looked into
-ANYWHERE = (0.0, 0.0)  # degrees: a day does not depend on the place
 
 
 def epoch_of_city(

@@ -43,6 +43,22 @@ TARGETS = {
     "training_cities": "synthetic cities to train on",
 }
 
+# Where a path has the name of a city, of a dataset.
+STAGES = "ingest|align|refine|rectify|project|heights|export|evaluate|report|predict"
+IN_PATH = (
+    (re.compile(rf"(tiles|score_dsm|results/({STAGES}))/(?P<name>[^/]+)(/.+)?"), "city"),
+    (re.compile(r"(benchmark|audit|submission|results/train)/(?P<name>[^/]+)(/.+)?"), "dataset"),
+)
+
+# Targets that are made of a dataset by its name, or of built-in cities by their own.
+WITHOUT_SCENES = re.compile(
+    r"(benchmark|audit|submission|results/(train|match|training_cities))/.+|training_cities"
+)
+
+EXAMPLE = "--example"  # the synthetic cities that come with the package
+CONFIG_OPTIONS = ("--configfile", "--configfiles")
+CORES = re.compile(r"--(cores|jobs|profile|executor)(=|$)|-[cj]")
+
 
 def list_targets(configfiles: Sequence[Path] | None = None) -> list[str]:
     """A line for each target, and the cities, scenes, datasets and methods to put into them."""
@@ -72,20 +88,6 @@ def rules() -> list[str]:
         for file in sorted((FILES / "workflow" / "rules").glob("*.smk"))
         for name in re.findall(r"^rule (\w+):", file.read_text(encoding="utf-8"), re.MULTILINE)
     ]
-
-
-# Where a path has the name of a city, of a dataset.
-STAGES = "ingest|align|refine|rectify|project|heights|export|evaluate|report|predict"
-IN_PATH = (
-    (re.compile(rf"(tiles|score_dsm|results/({STAGES}))/(?P<name>[^/]+)(/.+)?"), "city"),
-    (re.compile(r"(benchmark|audit|submission|results/train)/(?P<name>[^/]+)(/.+)?"), "dataset"),
-)
-
-
-# Targets that are made of a dataset by its name, or of built-in cities by their own.
-WITHOUT_SCENES = re.compile(
-    r"(benchmark|audit|submission|results/(train|match|training_cities))/.+|training_cities"
-)
 
 
 def need_scenes(given: Sequence[str], configfiles: Sequence[Path] | None = None) -> bool:
@@ -132,11 +134,6 @@ def refuse_unknown(given: Sequence[str], configfiles: Sequence[Path] | None = No
         if names and word not in names:
             remedy = did_you_mean(word, names, "stereotruth targets lists them")
             raise InputError(f"{word}: no such target", remedy=remedy)
-
-
-EXAMPLE = "--example"  # the synthetic cities that come with the package
-CONFIG_OPTIONS = ("--configfile", "--configfiles")
-CORES = re.compile(r"--(cores|jobs|profile|executor)(=|$)|-[cj]")
 
 
 def arguments_for(given: Sequence[str]) -> list[str]:

@@ -52,13 +52,17 @@ SPACING_M = 0.4
 SEED = 1
 TILES = "tiles: # the example's images are small", "  size: 256"
 
-
 SITE_CITY = replace(
     DEMO,
     name="Stack",
     scenes=(SceneSpec("Stack", (0.0, 0.0), 600, 600, 5, lidar_grid=(2, 1), ragged_m=(0.0, 0.0)),),
 )
 SITE = SiteSpec(SITE_CITY, images_drawn("Stack", SITE_CITY, 6, 560, seed=9))
+
+NAME, PREFIX = "Twin", "TW"
+LEAST_PX = 256  # of the left image's shorter side: fewer have no tile
+DENSITY = 1 / 0.4**2  # points per m², that of the six cities
+DENSITIES = 0.04, 100.0  # points per m², what simulate.lidar_spacing_m can be
 
 
 def make_example(folder: Path) -> str:
@@ -139,12 +143,6 @@ def append_settings(folder: Path, lines: Sequence[str]) -> None:
     """More lines at the end of a new project's configuration."""
     with (folder / "config.yaml").open("a", encoding="utf-8") as stream:
         stream.write("\n" + "\n".join(lines) + "\n")
-
-
-NAME, PREFIX = "Twin", "TW"
-LEAST_PX = 256  # of the left image's shorter side: fewer have no tile
-DENSITY = 1 / 0.4**2  # points per m², that of the six cities
-DENSITIES = 0.04, 100.0  # points per m², what simulate.lidar_spacing_m can be
 
 
 @dataclass(frozen=True)

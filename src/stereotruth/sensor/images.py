@@ -39,6 +39,10 @@ OUTLIER = 10.0  # of the largest value above all but a thousandth of the others:
 BELOW = 0.1  # of the largest value below zero: a fill value; noise of reflectances is above
 GET_AGAIN = "the file is damaged or cut short: get it again"
 
+# The blocks of a TIFF.
+PART_BYTES = 1 << 20  # that are inflated at once
+FARTHEST = 1 << 62  # place in a file; damaged ones may not fit 64 bits
+
 
 class Source:
     """Bands of an image file, read by windows from any thread as float32 with NaN for nodata.
@@ -315,9 +319,6 @@ def open_pair(
 
 
 # ------------------------------------------------------------------ the blocks of a TIFF
-
-PART_BYTES = 1 << 20  # that are inflated at once
-FARTHEST = 1 << 62  # place in a file; damaged ones may not fit 64 bits
 
 
 def damaged_block(path: Path, workers: int = 1, *, whole: bool = True) -> str:

@@ -31,6 +31,13 @@ MOST_CORNERS = 24  # of the polygon of feasible lines
 POLYGONS = 64  # that are kept while they are clipped
 RINGS = 32  # by which points are sorted
 
+Ints = NDArray[np.int64]
+
+BLOCK_BITS = PART_BITS + 3  # of parts of a cell: vertices of a row are found by such blocks
+MOST_STEP_POINTS = 4096  # that determine a breakline, at most
+INSIDE, COUNTS, HIGH = 1, 2, 4  # within reach; on a plane, for the breakline; on the high one
+BEYOND_SHARE = 0.08  # with more points below the low and above the high plane, these are crowns
+
 
 class Sides(NamedTuple):
     """Points on both sides of a step: ``u`` across, ``v`` along it, whether on the high side."""
@@ -241,14 +248,6 @@ def feasible_lines(sides: Sides, n: int, extent: float, band: Band, polygons: Po
             s -= 1
         s = _intersection(sides, n, band, polygons, s)
     return _without_gap(sides, n, band.spacing, polygons, s)
-
-
-Ints = NDArray[np.int64]
-
-BLOCK_BITS = PART_BITS + 3  # of parts of a cell: vertices of a row are found by such blocks
-MOST_STEP_POINTS = 4096  # that determine a breakline, at most
-INSIDE, COUNTS, HIGH = 1, 2, 4  # within reach; on a plane, for the breakline; on the high one
-BEYOND_SHARE = 0.08  # with more points below the low and above the high plane, these are crowns
 
 
 class StepPoints(NamedTuple):

@@ -50,6 +50,11 @@ BLOCK_CELLS = 256  # and cells
 HALOS = 12  # a group is so many halos wide: these cost a third more
 MOST_CELLS = 4096  # along a group's side
 
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SQUARES = 8  # along the side of a block, each of which images show or not
+
 
 def block_side(scale: SurfaceScale) -> int:
     """Cells along the side of a block: a power of two."""
@@ -293,12 +298,6 @@ def _groups(numbers: Sequence[Number], blocks: int) -> list[Group]:
     for number in numbers:
         groups.setdefault((number[0] // blocks, number[1] // blocks), []).append(number)
     return [tuple(group) for group in groups.values()]
-
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-
-SQUARES = 8  # along the side of a block, each of which images show or not
 
 
 class ShownGround(Protocol):

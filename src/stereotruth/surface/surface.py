@@ -40,6 +40,16 @@ Bools = NDArray[np.bool_]
 
 FACET_PARTS, STRIP_PARTS = 4, 3  # triangles that a cut triangle has at most
 
+# A point went through the surface if points higher than it by ``SurfaceScale.passed_m`` lie in all
+# directions around it, no farther than ROUGH_REACH spacings of points, and are no fewer than the
+# others there: a gap between crowns keeps its ground.
+SECTORS = 12
+WIDEST_GAP = 4  # empty sectors in a row, which leave no half of the directions without a point
+FEWEST_HIGHER = 3
+_ROOT_3 = np.sqrt(3.0)
+
+Parts = NDArray[np.int16]
+
 
 class Pieces(NamedTuple):
     """Parts of the triangles [m] that a breakline cuts; x, y count from a triangle's first vertex.
@@ -175,15 +185,6 @@ def with_pieces(
     out.count[size:] = 1
     index = np.arange(size, size + facets + strips, dtype=np.int32).reshape(-1, 3)
     return out, index[: facets // 3], index[facets // 3 :]
-
-
-# A point went through the surface if points higher than it by ``SurfaceScale.passed_m`` lie in all
-# directions around it, no farther than ROUGH_REACH spacings of points, and are no fewer than the
-# others there: a gap between crowns keeps its ground.
-SECTORS = 12
-WIDEST_GAP = 4  # empty sectors in a row, which leave no half of the directions without a point
-FEWEST_HIGHER = 3
-_ROOT_3 = np.sqrt(3.0)
 
 
 @kernel
@@ -331,9 +332,6 @@ def rough_tops(vertices: Vertices, near_undecided: Bools, scale: SurfaceScale) -
     residual = _rms_residuals(tops, triangles, is_flat)
     corner = number[top].take(triangles.corner)
     return RoughTops(corner, residual, rise, is_flat & np.isfinite(residual))
-
-
-Parts = NDArray[np.int16]
 
 
 class Core(NamedTuple):

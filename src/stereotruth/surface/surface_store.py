@@ -46,33 +46,6 @@ Bools = NDArray[np.bool_]
 
 SQUARE_BITS = PART_BITS + 4  # of parts of a cell: squares of 16 cells
 
-
-@kernel
-def _touching(x: Ints, y: Ints, corner: Steps, start: int, squares: Bools) -> Bools:
-    """Which triangles' bounding boxes touch one of the ``squares``."""
-    out = np.zeros(len(corner), np.bool_)
-    for t in range(len(corner)):
-        a, b, c = start + corner[t, 0], start + corner[t, 1], start + corner[t, 2]
-        west, east = min(x[a], x[b], x[c]) >> SQUARE_BITS, max(x[a], x[b], x[c]) >> SQUARE_BITS
-        south, north = min(y[a], y[b], y[c]) >> SQUARE_BITS, max(y[a], y[b], y[c]) >> SQUARE_BITS
-        for j in range(south, north + 1):
-            for i in range(west, east + 1):
-                out[t] |= squares[j, i]
-    return out
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """``squares`` bool [rows, cols] of the ground, from the vertices' origin, that are wanted."""
-
-    squares: Bools
-
-    def touching(self, vertices: Vertices, corner: Steps, start: int) -> Bools:
-        """Which triangles [m, 3] lie in the region at least in part; their corners count from the
-        vertex ``start``."""
-        return _touching(vertices.x, vertices.y, corner, start, self.squares)
-
-
 FORMAT = 4
 ATTRIBUTES, BLOCKS, GROUPS = "surface.json", "blocks.npy", "groups"
 CORNER = ("corner", "<i4", (3,))
@@ -105,6 +78,32 @@ TABLE = np.dtype(
 )  # fmt: skip
 Box = tuple[float, float, float, float]
 Columns = dict[str, NDArray]  # of one kind, by their names
+
+
+@kernel
+def _touching(x: Ints, y: Ints, corner: Steps, start: int, squares: Bools) -> Bools:
+    """Which triangles' bounding boxes touch one of the ``squares``."""
+    out = np.zeros(len(corner), np.bool_)
+    for t in range(len(corner)):
+        a, b, c = start + corner[t, 0], start + corner[t, 1], start + corner[t, 2]
+        west, east = min(x[a], x[b], x[c]) >> SQUARE_BITS, max(x[a], x[b], x[c]) >> SQUARE_BITS
+        south, north = min(y[a], y[b], y[c]) >> SQUARE_BITS, max(y[a], y[b], y[c]) >> SQUARE_BITS
+        for j in range(south, north + 1):
+            for i in range(west, east + 1):
+                out[t] |= squares[j, i]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """``squares`` bool [rows, cols] of the ground, from the vertices' origin, that are wanted."""
+
+    squares: Bools
+
+    def touching(self, vertices: Vertices, corner: Steps, start: int) -> Bools:
+        """Which triangles [m, 3] lie in the region at least in part; their corners count from the
+        vertex ``start``."""
+        return _touching(vertices.x, vertices.y, corner, start, self.squares)
 
 
 class Block(NamedTuple):

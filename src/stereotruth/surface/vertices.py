@@ -25,6 +25,11 @@ FEWEST_VERTICES = 3  # of an even square
 FEWEST_AROUND = 36  # of the nine squares: a quarter of their cells
 _SIDE = SQUARE_CELLS * PART
 
+Bytes = NDArray[np.uint8]
+Days = NDArray[np.uint16]
+
+_LOWEST = np.iinfo(np.int32).min
+
 
 class CellVertices(NamedTuple):
     """Vertices [n], one for each cell with points: plan position (parts of a cell), height (lattice
@@ -217,12 +222,6 @@ def even_ground(cells: CellVertices, grid: SquareGrid, tolerance: float) -> Even
                 height[s] = base + np.int64(np.rint(above / float(start[s + 1] - start[s])))
                 one[s] = order[start[s]]
     return EvenGround(is_even, height, one)
-
-
-Bytes = NDArray[np.uint8]
-Days = NDArray[np.uint16]
-
-_LOWEST = np.iinfo(np.int32).min
 
 
 class Vertices(NamedTuple):

@@ -24,6 +24,10 @@ from .section import (
     each_once,
 )
 
+Band = Annotated[Whole, Field(ge=1)]
+Weight = Annotated[Number, Field(gt=0)]
+Strips = Annotated[Whole, Field(ge=1, le=1000)]
+
 
 class Simulate(Section):
     """The configuration's section simulate."""
@@ -80,10 +84,6 @@ class Alignment(Section):
     a say any more, so that one more LiDAR file leaves all labels that it does not touch as they
     are, to the bit. Or an image of the images sheet and a copy of `results/adjust/<city>.json`: its
     correction stays as it is there, and images that came later are adjusted to it"""
-
-
-Band = Annotated[Whole, Field(ge=1)]
-Weight = Annotated[Number, Field(gt=0)]
 
 
 class Rectify(Section):
@@ -267,9 +267,6 @@ class Report(Section):
     sliders: Annotated[Whole, Field(ge=0), Unit("tiles")] = 30
     """of a city's page, evenly chosen, that have large pictures: a slider between left and warped
     right image, and their difference; all have thumbnails"""
-
-
-Strips = Annotated[Whole, Field(ge=1, le=1000)]
 
 
 class Dask(Section):

@@ -25,6 +25,21 @@ from .section import (
     over,
 )
 
+# Entries that there are without being written; their keys hold where an own entry lacks them.
+DATASETS = {
+    "synthetic": {  # what rule dataset makes
+        "root": "dataset",
+        "layout": "stereotruth",
+        "disparity_range": [-64, 128],
+        "methods": ["sgm"],
+    }
+}
+METHODS = {kind: {"kind": kind} for kind in ("sgm", "stereonet", "psmnet", "hmsmnet")}
+
+CHUNK = 256  # px of the result
+
+Pixels = Annotated[Number, Field(gt=0), Unit("px")]
+
 
 class StereoDatasetEntry(Section):
     """An entry of the configuration's benchmark.datasets."""
@@ -204,18 +219,6 @@ class Scoring(Section):
     """that are drawn for each method, of all cities; figure 10 shows up to six"""
 
 
-# Entries that there are without being written; their keys hold where an own entry lacks them.
-DATASETS = {
-    "synthetic": {  # what rule dataset makes
-        "root": "dataset",
-        "layout": "stereotruth",
-        "disparity_range": [-64, 128],
-        "methods": ["sgm"],
-    }
-}
-METHODS = {kind: {"kind": kind} for kind in ("sgm", "stereonet", "psmnet", "hmsmnet")}
-
-
 class Benchmark(Scoring):
     """The configuration's section benchmark."""
 
@@ -237,9 +240,6 @@ class Benchmark(Scoring):
 
     split: Literal["train", "val", "test"] | None = "test"
     """pairs that are matched and scored; null: all"""
-
-
-CHUNK = 256  # px of the result
 
 
 class SceneMatching(Section):
@@ -295,9 +295,6 @@ class Predict(SceneMatching):
 
     dsm: SurfaceModel = Field(default_factory=SurfaceModel)
     """of the surface models:"""
-
-
-Pixels = Annotated[Number, Field(gt=0), Unit("px")]
 
 
 class AuditLimits(Section):

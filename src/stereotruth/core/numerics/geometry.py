@@ -17,6 +17,9 @@ SEAM_DEG = -177.6
 """Where longitudes jump by 360: the meridian near that of 180° with least land, so that places on
 both sides of the line of 180° have longitudes that are near to each other."""
 
+Floats = NDArray[np.float64]
+Three = tuple[float, float, float]
+
 
 def turn(degrees: ArrayLike) -> NDArray[np.float64]:
     """Differences of longitudes, the shorter way around: in [−180, 180)."""
@@ -50,9 +53,6 @@ def exact_metres_per_degree(lat: float, height_m: float) -> NDArray[np.float64]:
     return np.radians([np.cos(phi) * prime_vertical, meridian])
 
 
-Floats = NDArray[np.float64]
-
-
 def corners_of_hull(x: Floats, y: Floats) -> list[int]:
     """Which points are corners of the convex hull of all, counterclockwise.
 
@@ -72,9 +72,6 @@ def corners_of_hull(x: Floats, y: Floats) -> list[int]:
             side.append(k)
         corners += side[:-1]
     return corners
-
-
-Three = tuple[float, float, float]
 
 
 @inner

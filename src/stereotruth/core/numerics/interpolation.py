@@ -12,6 +12,25 @@ from numpy.typing import ArrayLike, NDArray
 from ..kernels import inlined, inner
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+SIX_POINT_RADIUS = 3  # samples on either side that the six-point kernel weighs
+# Rows are taps, columns powers 3 to 0 of f: the kernel at f + 2, f + 1, f, 1 - f, 2 - f, 3 - f
+TAP_POLYNOMIALS = (
+    np.array(
+        [
+            [1, -2, 1, 0],
+            [-7, 15, -8, 0],
+            [16, -28, 0, 12],
+            [-16, 20, 8, 0],
+            [7, -6, -1, 0],
+            [-1, 1, 0, 0],
+        ]
+    )
+    / 12
+).astype(np.float32)
+
+Four = tuple[float, float, float, float]
 
 
 @inlined
@@ -41,26 +60,6 @@ def bilinear(grid: NDArray[np.floating], col: ArrayLike, row: ArrayLike) -> Floa
     below, beside = np.minimum(j + 1, height - 1), np.minimum(i + 1, width - 1)
     corners = grid[j, i], grid[j, beside], grid[below, i], grid[below, beside]
     return np.where(inside, between_four(*corners, col - i, row - j), np.nan)
-
-
-Singles = NDArray[np.float32]
-
-
-SIX_POINT_RADIUS = 3  # samples on either side that the six-point kernel weighs
-# Rows are taps, columns powers 3 to 0 of f: the kernel at f + 2, f + 1, f, 1 - f, 2 - f, 3 - f
-TAP_POLYNOMIALS = (
-    np.array(
-        [
-            [1, -2, 1, 0],
-            [-7, 15, -8, 0],
-            [16, -28, 0, 12],
-            [-16, 20, 8, 0],
-            [7, -6, -1, 0],
-            [-1, 1, 0, 0],
-        ]
-    )
-    / 12
-).astype(np.float32)
 
 
 @inlined
@@ -130,9 +129,6 @@ def six_point_weights_of_row(f: Singles, weights: Singles) -> None:
         a, b, c, d = TAP_POLYNOMIALS[tap]
         for k in range(f.size):
             weights[tap, k] = ((a * f[k] + b) * f[k] + c) * f[k] + d
-
-
-Four = tuple[float, float, float, float]
 
 
 @inlined

@@ -13,10 +13,14 @@ from ..kernels import inner
 
 Floats = NDArray[np.float64]
 
-
 TO_SIGMA = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 TUKEY = 4.685  # standard deviations at which the biweight is 0: 95 % efficient for normal errors
 HUBER = 1.345  # standard deviations up to which Huber's weight is 1: the same efficiency
+
+LIMITS = (0.5, 1.0, 3.0)  # px
+SMALLEST_SIGMA = 1e-4  # px
+SIGMA_STEP = 0.01  # in ln: resolution of the deciles of uncertainties
+SIGMA_BINS = 1400  # up to 120 px; what is beyond counts into the outer bins
 
 
 @inner
@@ -72,12 +76,6 @@ def reweighted_fit(
         if np.abs(step).max() < 1e-6 * sigma:
             break
     return found
-
-
-LIMITS = (0.5, 1.0, 3.0)  # px
-SMALLEST_SIGMA = 1e-4  # px
-SIGMA_STEP = 0.01  # in ln: resolution of the deciles of uncertainties
-SIGMA_BINS = 1400  # up to 120 px; what is beyond counts into the outer bins
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,18 @@ from .provenance import own_digest
 Made = TypeVar("Made")
 LONGEST_NAME = 100  # bytes; a file's name has 255, with what is added to it
 
+RUN = re.compile(r"'*[=+\-@\t\r]")  # begins what spreadsheets take for a formula
+MARK = "'"  # before such texts
+
+FOREIGN = (  # what other programs leave beside the files that they open; in lower case
+    "*.aux.xml",  # GDAL, QGIS: statistics
+    "*.ovr",  # GDAL, QGIS: pyramids
+    *("*.qgs", "*.qgz", "*.qgs~", "*.qgz~", "*.qml", "*.qmd", "*.points"),  # QGIS
+    *(".ds_store", "._*", "thumbs.db", "desktop.ini", ".directory"),  # file managers
+)
+
+LONGEST_PATH = 1000  # bytes of a path below a folder
+
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
@@ -69,10 +81,6 @@ def link(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copyfile(source, target)
-
-
-RUN = re.compile(r"'*[=+\-@\t\r]")  # begins what spreadsheets take for a formula
-MARK = "'"  # before such texts
 
 
 def as_text(value: Any) -> Any:
@@ -202,14 +210,6 @@ def read_record(
         ) from error
 
 
-FOREIGN = (  # what other programs leave beside the files that they open; in lower case
-    "*.aux.xml",  # GDAL, QGIS: statistics
-    "*.ovr",  # GDAL, QGIS: pyramids
-    *("*.qgs", "*.qgz", "*.qgs~", "*.qgz~", "*.qml", "*.qmd", "*.points"),  # QGIS
-    *(".ds_store", "._*", "thumbs.db", "desktop.ini", ".directory"),  # file managers
-)
-
-
 def is_foreign(name: str) -> bool:
     """Whether a file of this name is one that another program has left."""
     return any(fnmatch(name.lower(), pattern) for pattern in FOREIGN)
@@ -231,9 +231,6 @@ def files_below(
         seen.add((state.st_dev, state.st_ino))
         folders[:] = sorted(name for name in folders if enter(Path(place, name)))
         yield from (Path(place, name) for name in sorted(names))
-
-
-LONGEST_PATH = 1000  # bytes of a path below a folder
 
 
 def defect_of(name: object, longest: int = LONGEST_NAME) -> str:

@@ -30,6 +30,13 @@ from .provenance import digest
 if TYPE_CHECKING:
     import xarray as xr
 
+METADATA = "zarr.json"  # of a store: all of its arrays' with its own
+SEAL = "metadata_digest"  # attribute of a store
+CONVENTIONS = (
+    "arrays are [y, x]; pixel (0, 0) is the centre of the upper-left pixel; "
+    "disparity = x_left - x_right in px of the epipolar grid"
+)
+
 
 def damaged_store(error: BaseException, inputs: Iterable[str | Path]) -> InputError | None:
     """The damaged Zarr store among a failed job's ``inputs``; None if it failed for another cause.
@@ -53,14 +60,6 @@ def damaged_store(error: BaseException, inputs: Iterable[str | Path]) -> InputEr
                 remedy="delete it and run the workflow again",
             )
     return None
-
-
-METADATA = "zarr.json"  # of a store: all of its arrays' with its own
-SEAL = "metadata_digest"  # attribute of a store
-CONVENTIONS = (
-    "arrays are [y, x]; pixel (0, 0) is the centre of the upper-left pixel; "
-    "disparity = x_left - x_right in px of the epipolar grid"
-)
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,13 @@ TICK_NS = 2_000_000_000  # of the clocks of file systems, at most
 # What runs write in the working directory, which may lie in the folder of a dataset.
 WRITTEN_BY_RUNS = ("results", "logs", "benchmark", "audit")
 
+Marks = Mapping[str, tuple[int, ...]]
+
+log = logging.getLogger("stereotruth")
+
+MADE = Path(".snakemake", "stereotruth", "made")  # what the jobs of a run have made
+_inputs: Marks = {}  # of this process's job
+
 
 def _files(path: Path) -> Iterator[tuple[str, Path]]:
     """All files in a folder, by name, links followed; or the file itself."""
@@ -117,9 +124,6 @@ class Checksums:
                 scratch.unlink()
 
 
-Marks = Mapping[str, tuple[int, ...]]
-
-
 def marks(paths: Iterable[str | Path]) -> Marks:
     """What tells at the cost of one call each that files, or whole folders, were replaced."""
     return {str(Path(path).absolute()): _mark(Path(path)) for path in paths}
@@ -144,9 +148,6 @@ def _mark(path: Path) -> tuple[int, ...]:
     if path.is_dir():  # the workflow's own are replaced, never written into
         return (state.st_ino,)
     return state.st_ino, state.st_size, state.st_mtime_ns
-
-
-log = logging.getLogger("stereotruth")
 
 
 class FileLock:
@@ -215,10 +216,6 @@ def exclusive(path: str | Path) -> Iterator[None]:
     finally:
         lock.file.unlink(missing_ok=True)
         lock.close()
-
-
-MADE = Path(".snakemake", "stereotruth", "made")  # what the jobs of a run have made
-_inputs: Marks = {}  # of this process's job
 
 
 @contextmanager

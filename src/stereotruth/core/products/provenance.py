@@ -26,6 +26,9 @@ CONFIG = (
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "zarr", "numcodecs")
 LIBRARIES = (*LIBRARIES, "rasterio", "pyproj", "laspy", "lazrs")
 
+# Pythons differ in their trees.
+CACHE = Path(__file__).parent / "__pycache__" / f"sources-{sys.implementation.cache_tag}.json"
+
 
 def file_sha256(path: str | Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal."""
@@ -154,10 +157,6 @@ def _parsed(module: str, file: Path) -> tuple[str, list[str]]:
     for table in _with_table(file)[1:]:
         code.update(table.read_bytes())
     return code.hexdigest(), sorted(imports)
-
-
-# Pythons differ in their trees.
-CACHE = Path(__file__).parent / "__pycache__" / f"sources-{sys.implementation.cache_tag}.json"
 
 
 @cache

@@ -37,6 +37,15 @@ os.environ.setdefault("CPL_VSIL_CURL_ALLOWED_FILENAME", "none")
 os.environ.setdefault("GDAL_HTTP_MAX_RETRY", "4")  # of what is read by its parts
 os.environ.setdefault("GDAL_HTTP_RETRY_DELAY", "1")  # s, twice as long each time
 
+Floats = NDArray[np.float64]
+
+FILLS = (0, -1, -99, -999, -9999, -99999, -32767, -32768)  # and the ends of an integer type
+OFTEN = 10
+LEAST = 10  # cells of an extreme that is none of FILLS: fewer are blunders
+FAR = 50.0  # m or px
+RIMS = np.geomspace(1.0, 1e6, 121)  # bins of differences between neighbours, m or px
+MOST_CELLS = 1 << 20  # that are read at once, where the file's blocks allow it
+
 
 def open_raster(
     path: str | Path, mode: str = "r", *, formats: Sequence[str] = FORMATS, **options: Any
@@ -54,16 +63,6 @@ def open_raster(
         # vertical parts of systems are not told otherwise; rasterio.open takes one format only
         with rasterio.Env(GTIFF_REPORT_COMPD_CS=True, **reading):
             return rasterio.DatasetReader(name, driver=list(formats), **options)
-
-
-Floats = NDArray[np.float64]
-
-FILLS = (0, -1, -99, -999, -9999, -99999, -32767, -32768)  # and the ends of an integer type
-OFTEN = 10
-LEAST = 10  # cells of an extreme that is none of FILLS: fewer are blunders
-FAR = 50.0  # m or px
-RIMS = np.geomspace(1.0, 1e6, 121)  # bins of differences between neighbours, m or px
-MOST_CELLS = 1 << 20  # that are read at once, where the file's blocks allow it
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,36 @@ TRIES, WAIT_S = 6, 0.5  # of a question, and before the second of them; doubled 
 AT_ONCE = 4  # requests
 _WAYS = "s3://bucket/path and https://host/path can be read"
 
+_COPIED = {".rpb", ".txt", ".csv"}  # files that are fetched
+RPC_ENDINGS = (".RPB", ".rpb", "_RPC.TXT", "_rpc.txt", "_RPC.txt")
+
+# What clients fail with, by the names of their exceptions: the problem, and the remedy. Web servers
+# are asked again where nobody answers; clients of buckets do so themselves.
+NOBODY = "nobody answers there, or not to the end"
+ENVIRONMENT = "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+FAILURES = {
+    ("NoCredentialsError", "PartialCredentialsError", "ProfileNotFound"): (
+        "no credentials for it",
+        f"export {ENVIRONMENT}, or name a profile by AWS_PROFILE",
+    ),
+    ("gaierror", "ClientConnectorDNSError"): (
+        "its host is unknown",
+        "correct the URL or AWS_ENDPOINT_URL, and check the network",
+    ),
+    ("TooManyRedirects",): (
+        f"its server redirects more than {MOST_REDIRECTS} times",
+        "check the URL",
+    ),
+    (
+        *("EndpointConnectionError", "ConnectTimeoutError", "TimeoutError"),
+        *("ClientConnectionError", "ClientPayloadError", "ClientResponseError"),
+    ): (NOBODY, "check the URL (or AWS_ENDPOINT_URL) and the network, or try again later"),
+    ("PermissionError",): (
+        "the server refuses access",
+        f"check {ENVIRONMENT}, which need the right to read and list",
+    ),
+}
+
 
 def is_remote(text: str) -> bool:
     """Whether a cell of the sheet is a URL."""
@@ -97,10 +127,6 @@ def url_of(path: str | Path) -> str | None:
         return None
     scheme, *rest = inside.parts
     return f"{scheme}://{'/'.join(rest)}" if Path(path).suffix.lower() not in _COPIED else None
-
-
-_COPIED = {".rpb", ".txt", ".csv"}  # files that are fetched
-RPC_ENDINGS = (".RPB", ".rpb", "_RPC.TXT", "_rpc.txt", "_RPC.txt")
 
 
 def bucket(url: str) -> tuple[Any, str]:
@@ -164,34 +190,6 @@ def _look(url: str, hosts: frozenset[str] = frozenset()) -> State | None:
 
 def _is_web(url: str) -> bool:
     return urlsplit(url).scheme in WEB
-
-
-# What clients fail with, by the names of their exceptions: the problem, and the remedy. Web servers
-# are asked again where nobody answers; clients of buckets do so themselves.
-NOBODY = "nobody answers there, or not to the end"
-ENVIRONMENT = "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
-FAILURES = {
-    ("NoCredentialsError", "PartialCredentialsError", "ProfileNotFound"): (
-        "no credentials for it",
-        f"export {ENVIRONMENT}, or name a profile by AWS_PROFILE",
-    ),
-    ("gaierror", "ClientConnectorDNSError"): (
-        "its host is unknown",
-        "correct the URL or AWS_ENDPOINT_URL, and check the network",
-    ),
-    ("TooManyRedirects",): (
-        f"its server redirects more than {MOST_REDIRECTS} times",
-        "check the URL",
-    ),
-    (
-        *("EndpointConnectionError", "ConnectTimeoutError", "TimeoutError"),
-        *("ClientConnectionError", "ClientPayloadError", "ClientResponseError"),
-    ): (NOBODY, "check the URL (or AWS_ENDPOINT_URL) and the network, or try again later"),
-    ("PermissionError",): (
-        "the server refuses access",
-        f"check {ENVIRONMENT}, which need the right to read and list",
-    ),
-}
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:

@@ -27,6 +27,12 @@ MARGIN = 0.03  # of the longer side, around all footprints
 BARS = 80  # most bars of a histogram
 NORMAL = (68.3, 95.4)  # % of normal errors below once and twice their uncertainty
 
+NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
+GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen
+DIFFERENCE = 0.12  # of the left image's contrast, at the ends of the colours of a difference
+
+LARGE = ("left", "warped right", "left − warped right", "disparity", "hillshade")
+
 
 @styled
 def tile_map(
@@ -162,14 +168,6 @@ def calibration(deciles: Sequence[Mapping[str, float]], caption: str) -> Chart |
     plot.axis.set_ylim(0, 103)
     plot.axis.legend(loc="lower right")
     return plot.chart(deciles)
-
-
-NO_MATCH = (60, 72, 110)  # pixels without a label, in the warped image
-GAMMA = 0.75  # of grey pictures: roofs are bright, and the ground is to be seen
-DIFFERENCE = 0.12  # of the left image's contrast, at the ends of the colours of a difference
-
-
-LARGE = ("left", "warped right", "left − warped right", "disparity", "hillshade")
 
 
 @dataclass

@@ -33,6 +33,12 @@ PAGES = (
 TEMPLATE = Path(__file__).with_name("index.html.jinja")
 LOOK_PX, LOOK_BYTES = 260, 16_000  # of a thumbnail
 
+CITY_COLUMNS = (
+    "city", "left image, disparity", "pairs", "size, px", "labelled", "known to, px (median)",
+    "for 95 %, px", "train", "val", "test", "error to truth, px", "SIFT − label, px",
+    "beyond a limit", "files",
+)  # fmt: skip
+
 
 def pages_of(root: Path) -> list[Path]:
     """All pages below a folder but the index, sorted."""
@@ -149,13 +155,6 @@ def _totals(exports: list[dict[str, Any]]) -> list[Headline]:
         Headline("labels", f"{labels / 1e6:.1f} million", f"{100 * labels / sum(pixels):.1f} %"),
         Headline("train, val, test", ", ".join(str(n) for n in by.values()), "pairs"),
     ]
-
-
-CITY_COLUMNS = (
-    "city", "left image, disparity", "pairs", "size, px", "labelled", "known to, px (median)",
-    "for 95 %, px", "train", "val", "test", "error to truth, px", "SIFT − label, px",
-    "beyond a limit", "files",
-)  # fmt: skip
 
 
 def _city(root: Path, out: Path, page: Path, export: Mapping[str, Any]) -> tuple[Cell, ...]:

@@ -38,6 +38,21 @@ Record = Mapping[str, Any]
 Records = Mapping[str, Record]
 Row = Mapping[str, str]
 
+# Table 4 of the paper: (city, class), pairs, matches, mean of mean errors and of mean absolute
+# errors in px.
+PUBLISHED = (
+    ("Kunming", "building", 36, 3576, -0.69, 0.48),
+    ("Kunming", "vegetation", 216, 54838, -0.869, 0.66),
+    ("Qichun", "building", 128, 16643, -0.11, 0.51),
+    ("Qichun", "vegetation", 736, 99457, -0.5, 0.79),
+    ("Yingde", "building", 90, 13969, 0.09, 0.58),
+    ("Yingde", "vegetation", 438, 63226, 0.11, 0.73),
+    ("Shaoguan", "building", 77, 6744, -0.24, 0.42),
+    ("Wuhan", "building", 20, 1776, -0.37, 0.49),
+    ("Hengyang", "building", 22, 1139, -0.03, 0.32),
+    ("US3D", "building", 49, 3750, -0.20, 0.89),
+)
+
 
 def headlines(
     rows: Rows,
@@ -225,21 +240,6 @@ def _gcps(alignments: Records, refined: Records) -> Headline:
 
 
 # ------------------------------------------------------------------------- tables of sections
-
-# Table 4 of the paper: (city, class), pairs, matches, mean of mean errors and of mean absolute
-# errors in px.
-PUBLISHED = (
-    ("Kunming", "building", 36, 3576, -0.69, 0.48),
-    ("Kunming", "vegetation", 216, 54838, -0.869, 0.66),
-    ("Qichun", "building", 128, 16643, -0.11, 0.51),
-    ("Qichun", "vegetation", 736, 99457, -0.5, 0.79),
-    ("Yingde", "building", 90, 13969, 0.09, 0.58),
-    ("Yingde", "vegetation", 438, 63226, 0.11, 0.73),
-    ("Shaoguan", "building", 77, 6744, -0.24, 0.42),
-    ("Wuhan", "building", 20, 1776, -0.37, 0.49),
-    ("Hengyang", "building", 22, 1139, -0.03, 0.32),
-    ("US3D", "building", 49, 3750, -0.20, 0.89),
-)
 
 
 def residuals(record: Record, later: Record) -> dict[str, Any]:

@@ -71,6 +71,17 @@ SOLID = "all but trees and water"
 OPEN = "off steps"  # and off crowns: the vertical error proper
 STEPS = "beside steps and trees"
 
+# The verdict.
+BLOCK = 512  # cells of a window
+PARTS = 48  # windows that the registration sees, about
+AROUND_M = REACH_M + 2.0  # of a window, for what is said of its points
+MAP_SIDE = 700  # squares of the map of differences at most
+
+# The page.
+MAP_BYTES = 250_000
+MAP_PX = 700
+TEMPLATE = Path(__file__).with_name("page.html.jinja")
+
 
 @dataclass
 class HeightErrors:
@@ -142,11 +153,6 @@ def strata(lattice: Lattice, classified: bool) -> dict[str, NDArray[np.bool_]]:
 
 
 # -------------------------------------------------------------------------------------- the verdict
-
-BLOCK = 512  # cells of a window
-PARTS = 48  # windows that the registration sees, about
-AROUND_M = REACH_M + 2.0  # of a window, for what is said of its points
-MAP_SIDE = 700  # squares of the map of differences at most
 
 
 @dataclass(frozen=True)
@@ -271,10 +277,6 @@ def score_surface_model(
 
 
 # ----------------------------------------------------------------------------------------- the page
-
-MAP_BYTES = 250_000
-MAP_PX = 700
-TEMPLATE = Path(__file__).with_name("page.html.jinja")
 
 
 def describe(figures: dict[str, Any]) -> str:
