@@ -1,8 +1,8 @@
 """What products follow from: Snakemake makes again what has other params (profiles/default).
 
-Beside its settings each rule has ``code``, a digest of the modules that run, and ``sources``: digests
-of its script, and of all that its inputs follow from: of users' files their content, of products
-the params and sources of the rule that makes them. So what is behind an edit is due until it is
+Beside its settings each rule has ``code``, a digest of the modules that run, and ``sources``, digests
+of its script and of all that its inputs follow from. Of users' files that is their content, of
+products the params and sources of the rule that makes them. So what is behind an edit is due until it is
 made, whatever jobs failed or were killed in between. Times of users' files count for nothing.
 """
 

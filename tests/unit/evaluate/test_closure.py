@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zarr
 
 from stereotruth.align.alignment import Alignment, ViewFit
 from stereotruth.align.records import write_equations
@@ -152,3 +153,23 @@ def test_pairs_without_a_triplet_are_refused_by_the_remedy():
     pairs = [PairFiles(f"{a}-{b}", a, b, nowhere, nowhere, nowhere) for a, b in ("AB", "BC")]
     with pytest.raises(InputError, match="A-B, B-C and A-C"):
         closure("Town", pairs)
+
+
+def test_an_offset_of_one_pair_is_beyond_the_uncertainty(tmp_path):
+    """Three times the noise of a label, which pixels a few px apart share."""
+    triplet = triplet_of(tmp_path, 3 * NOISE, noise=NOISE)
+    one, two = shares(*closure_of_labels(triplet))
+    assert one < 20 and two < 60
+
+
+def test_labels_beside_a_height_step_are_not_compared(tmp_path):
+    """Between two labels of different surfaces there is no label."""
+    triplet = triplet_of(tmp_path)
+    whole = len(closure_of_labels(triplet)[0])
+    array = zarr.open_group(triplet.bc.disparity, mode="r+")["disparity"]
+    values = array[:]
+    values[:, ::4] += 3.0
+    array[:] = values
+    closures, _ = closure_of_labels(triplet)
+    assert len(closures) < 0.6 * whole
+    assert np.median(np.abs(closures)) < 0.003

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from stereocities.truth import REASONS
 from stereotruth.core.status import Reason
 from stereotruth.labels.change_evidence import LabelledWindow
 from stereotruth.labels.change_reasons import (
@@ -173,3 +174,10 @@ def test_reasons_follow_from_what_is_near(surface_class, above_m, now_m, diachro
     small = replace(window, rows=rows, cols=cols)
     change = seen.within(part).reasons(small, diachronic=diachronic)[inner]
     assert change.any() and np.array_equal(change, whole[part][inner])
+
+
+def test_codes_are_those_of_the_simulator_but_for_texture() -> None:
+    """A change of texture alone is none of height; where nothing tells, the reason is unknown."""
+    names = [reason.name.lower() for reason in Reason]
+    assert names[:-1] == REASONS.split()[:-1]
+    assert (names[-1], REASONS.split()[-1]) == ("unknown", "texture")

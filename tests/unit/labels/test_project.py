@@ -465,3 +465,55 @@ def test_points_elsewhere_are_refused(plane, tmp_path) -> None:
     refused(plane, write_points(tmp_path / "far", far), "wrong coordinate system.*degrees away")
     with pytest.raises(InputError, match=r"114\.3.*30\.6"):
         project_with(*plane.images, [tmp_path / "far" / "points.points"], tmp_path / "x.zarr")
+
+
+def test_surfaces_are_not_mixed_at_the_edge_of_a_roof(box) -> None:
+    """Each label is that of the roof or of the ground, and the wrong one less often."""
+    levels = [box.truth[box.surface[2] == h].mean() for h in (HEIGHT, ROOF)]
+    off = {}
+    for recipe in ("surface", "paper"):
+        grid = box.project(recipe=recipe, correlation_threshold=-1)
+        d = grid["disparity"].values
+        d = d[np.isfinite(d)]
+        off[recipe] = (np.minimum(abs(d - levels[0]), abs(d - levels[1])) > 0.05).sum()
+        right = abs(grid["disparity"].values - box.truth) < 1
+        seen_by_both = (box.surface[2] == HEIGHT) | (box.surface[2] == ROOF)
+        known = np.isfinite(grid["disparity"].values) & seen_by_both
+        off[recipe + " wrong"] = (known & ~right).sum()
+    assert off["surface"] == 0
+    assert off["surface wrong"] < 0.5 * off["paper wrong"]
+
+
+def test_box_hides_a_run_of_the_ground(box) -> None:
+    """Hidden ground beside the box, walls without points included, to 2 px at its border."""
+    grid = box.project()
+    status = grid["status"].values
+    hidden = hidden_truth(box)
+    assert 800 < hidden.sum() < 20_000
+    sure = hidden & ~dilated(~hidden, 2)
+    labelled = is_labelled(status)
+    assert not labelled[sure].any()
+    with_points = status[sure & (status != Status.NO_POINTS)]
+    assert np.isin(with_points, (Status.HIDDEN_IN_RIGHT, Status.EDGE_IN_PIXEL)).all()
+    assert (with_points == Status.HIDDEN_IN_RIGHT).mean() > 0.85  # others: behind the wall's strip
+    wall = (box.surface[2] > HEIGHT) & (box.surface[2] < ROOF)
+    clear = ~dilated(hidden | wall) & (status != Status.NO_POINTS)
+    assert (status == Status.HIDDEN_IN_RIGHT)[clear].mean() < 1e-3
+    roof = box.surface[2] == ROOF
+    inner = roof & ~dilated(~roof, 5) & (status != Status.NO_POINTS)
+    assert labelled[inner].mean() > 0.999
+    # Along a row: as many px without a label, wall included, as the roof has more disparity.
+    cols = np.flatnonzero((hidden | wall).any(axis=0))
+    run = (~labelled[:, cols[0] - 3 : cols[-1] + 3]).sum(axis=1)
+    rise = box.truth[roof].mean() - box.truth[box.surface[2] == HEIGHT].mean()
+    assert np.median(run[run > 0.8 * rise]) == pytest.approx(rise, abs=1.5)
+
+
+def test_correlation_removes_most_of_what_is_hidden(box) -> None:
+    grid = box.project(recipe="paper")
+    labelled = grid["status"].values == Status.LABELLED
+    hidden = hidden_truth(box)
+    assert labelled[hidden].mean() < 0.25
+    every = box.project(recipe="paper", correlation_threshold=-1)
+    none = every["status"].values == Status.LABELLED
+    assert none[hidden & (box.surface[2] == HEIGHT)].mean() > 0.95

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from stereotruth.labels import project as module
 from stereotruth.labels import recipe
 from stereotruth.lidar.point_store import ATTRIBUTES
 
-from ...synthetic.box_scene import Scene, alignment_of, project_with, write_points
+from ...synthetic.box_scene import Scene, alignment_of, project_with, write_image, write_points
 from ...synthetic.stores import tree
 
 
@@ -172,3 +173,14 @@ def test_a_scheduler_that_is_not_there_is_named():
         pass
     with dask_scheduler(None) as scheduler:
         assert scheduler is dask.threaded.get
+
+
+@pytest.mark.slow
+def test_other_images_settings_or_code_are_other_labels(scene, tmp_path):
+    out = tmp_path / "out.zarr"
+    everything = project(scene, [scene.store], out)
+    assert project(scene, [scene.store], out, min_points=3) == everything
+    left = zarr.open_group(scene.images[0], mode="r")["image"][:]
+    shutil.rmtree(scene.images[0])
+    name(write_image(scene.images[0], scene.model, np.maximum(left, 2) - 1), "another left image")
+    assert project(scene, [scene.store], out, min_points=3) == everything

@@ -19,6 +19,7 @@ from ....synthetic.analytic_town import (
     EPSG,
     NORTH,
     SIDE,
+    TO_WGS84,
     WEST,
     Points,
     Town,
@@ -197,3 +198,39 @@ def test_figures_are_those_of_all_errors():
     assert found["nmad_m"] == pytest.approx(1.4826 * np.median(np.abs(known - median)), abs=0.02)
     assert found["le90_m"] == pytest.approx(np.quantile(np.abs(known), 0.9), abs=0.01)
     assert found["share_over_1_m"] == pytest.approx((np.abs(known) > 1).mean(), abs=1e-4)
+
+
+@pytest.mark.slow
+def test_holes_and_spikes_are_counted(judge):
+    heights, rng = TOWN.heights(), np.random.default_rng(0)
+    heights[100:220, 150:300] = np.nan
+    share = 120 * 150 / heights.size
+    spikes = rng.random(heights.shape) < 0.002
+    found = judge(np.where(spikes, heights + 25.0, heights))
+    assert 1 - found["errors"][SOLID]["known_share"] == pytest.approx(share, abs=0.01)
+    # a cell that is off takes part in the heights of four squares
+    assert 0.003 < found["errors"][OPEN]["share_over_3_m"] < 0.01
+    assert found["errors"][OPEN]["nmad_m"] < 0.05
+
+
+@pytest.mark.slow
+def test_slopes_are_told(judge):
+    steep = Town(boxes=0, hills_m=12.0)  # up to 12/17 of slope: 45 degrees and less
+    errors = judge(steep.heights(), Points(steep))["errors"]
+    total = sum(of["points"] for name, of in errors.items() if name.startswith("ground, slope"))
+    assert total > 0.9 * errors[OPEN]["points"]
+    assert errors["ground, slope 30–90°"]["points"] > 0.1 * total
+
+
+@pytest.mark.slow
+def test_a_geoid_left_out_is_a_shift_up(judge, tmp_path):
+    lon, lat = TO_WGS84.transform(WEST, NORTH)
+    grid = tmp_path / "geoid.tif"
+    options = {"driver": "GTiff", "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(
+        grid, "w", width=9, height=9, transform=from_origin(lon - 1, lat + 1, 0.25, 0.25), **options
+    ) as target:
+        target.write(np.full((9, 9), -17.0, np.float32), 1)
+    orthometric = TOWN.heights() + 17.0
+    assert judge(orthometric)["registration"]["up_m"] == pytest.approx(17.0, abs=0.01)
+    assert abs(judge(orthometric, geoid=grid)["registration"]["up_m"]) < 0.01
