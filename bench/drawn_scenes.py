@@ -66,12 +66,12 @@ class Draw:
     """What a scene is drawn from.
 
     ``zones``: land use, one of ZONES. ``ground_m2`` per crown, None for no crowns, and what follows
-    it: as in :class:`Canopy`. ``density``: LiDAR points per m². ``noise``, ``gain``: of both
-    images, as in :mod:`synthetic_pairs`. ``later``: the right image is of an hour later. ``bare``:
-    the view without leaves, or "". ``vehicles`` per hectare. ``relief_m``: height range of the
-    ground. ``roofs``: "mixed" or "flat". ``buildings``: share of them that is built. ``sun_deg``:
-    the sun's elevation, None for one that is drawn. ``jitter_px``, ``psf_px`` (left, right),
-    ``saturates``: as in :class:`.cities.Jitter` and :class:`.cities.ViewSpec`.
+    it: as in :class:`.cities.Canopy`. ``density``: LiDAR points per m². ``noise``, ``gain``: of
+    both images, as in :mod:`synthetic_pairs`. ``later``: the right image is of an hour later.
+    ``bare``: the view without leaves, or "". ``vehicles`` per hectare. ``relief_m``: height range
+    of the ground. ``roofs``: "mixed" or "flat". ``buildings``: share of them that is built.
+    ``sun_deg``: the sun's elevation, None for one that is drawn. ``jitter_px``, ``psf_px`` (left,
+    right), ``saturates``: as in :class:`.cities.Jitter` and :class:`.cities.ViewSpec`.
     """
 
     seed: int

@@ -21,7 +21,7 @@ import numpy as np
 from stereotruth.core.kernels import inlined, kernel
 
 PATCH_M = 0.25
-PATCHES_A_CELL = 32  # of surfaces.CELL_M, along each side
+PATCHES_A_CELL = 32  # of CELL_M, along each side
 NOTHING = -1e9  # z where no patch stands
 STEP_M = 0.05  # what a ray enters deeper below a patch's top than this is its side
 
@@ -108,8 +108,8 @@ class Surfaces(NamedTuple):
     in the cell. ``sun_top`` and ``lidar_top``: :func:`horizon` toward the sun and of LiDAR pulses.
     ``zones``, ``zone_cells``, ``zone_near``: see :func:`.layout.draw_zones`. ``resurfaced``: share
     of the streets that have another texture.
-    ``patches`` float32[rows, cols, 3]: z in the middle and slopes along x and y of the patches of
-    :mod:`.patches`, from cell (``patch_i``, ``patch_j``) on; ``patch_side`` uint8[rows, cols]:
+    ``patches`` float32[rows, cols, 3]: z in the middle and slopes along x and y of the patches,
+    from cell (``patch_i``, ``patch_j``) on; ``patch_side`` uint8[rows, cols]:
     direction in which their sides look, counter-clockwise from east, in 256 parts of a turn.
     ``patch_building`` int32[rows, cols]: the building that a patch is part of, −1 for none.
     ``paint`` uint16[rows, cols]: reflectance of ground and roofs there, in parts of PAINT. A drawn

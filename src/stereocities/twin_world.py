@@ -234,8 +234,8 @@ def twin_city(
     the middle of the place; None: all of it. ``sun_deg``: azimuth and elevation. ``rpcs``: of
     the left and the right image, instead of GaoFen-7's camera; images have the size that the place
     has in them then. ``pose_seed`` draws orbit, attitude and the bias of the RPCs. Heights are
-    taken as ellipsoidal. Raises InputError of :func:`.twin_points.extent_of` and
-    :func:`.given_rpcs.read_rpc`.
+    taken as ellipsoidal. Raises InputError of :func:`extent_of` and
+    :func:`.rpcs.read_rpc`.
     """
     of = extent_of(file, crs)
     low, high = of.low, of.high

@@ -72,7 +72,7 @@ def write(path: Path, heights: np.ndarray) -> Path:
 
 
 class Points:
-    """Points of a town, 3 cm of noise each; a :class:`Reference` as LiDAR would be."""
+    """Points of a town, 3 cm of noise each; a :class:`.reference.Reference` as LiDAR would be."""
 
     name, classified = "points", True
 

@@ -16,7 +16,7 @@ GROWN: dict[str, Any] = {}
 
 
 def grow_once(*arguments: Any) -> Any:
-    """As :func:`grow`, which is most of what a model takes."""
+    """As :func:`.fit.grow`, which is most of what a model takes."""
     key = hashlib.sha256(pickle.dumps(arguments)).hexdigest()
     if key not in GROWN:
         GROWN[key] = grow(*arguments)

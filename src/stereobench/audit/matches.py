@@ -1,6 +1,6 @@
 """Matches of images: of a pair to sub-pixel, knowing nothing of its labels, and of shared ground.
 
-SIFT key points (:mod:`stereotruth.dataset.sift_matches`) are matched over some rows and a wide
+SIFT key points (:mod:`stereotruth.tiles.sift_matches`) are matched over some rows and a wide
 range of disparities of either sign; least-squares matching (Gruen 1985) then finds, in a window
 around the left pixel nearest the key point, the disparity there, its two slopes, and the vertical
 parallax.

@@ -157,7 +157,7 @@ class SemiGlobalMatcher:
         disparity_range: tuple[int, int],
         scaling: GreyMapping | None = None,
     ) -> NDArray[np.float32]:
-        """Disparity float32[h, w] px, in steps of 1/16 px; see :class:`.methods.Matcher`."""
+        """Disparity float32[h, w] px, in steps of 1/16 px; see :class:`.matcher.Matcher`."""
         low, high = disparity_range
         matcher = self.opencv(disparity_range)
         before = max(low + matcher.getNumDisparities(), 0)

@@ -84,7 +84,7 @@ def mixed(precision: str, device: torch.device) -> Any:
 
 
 class NetworkMethod:
-    """A network with its weights as a method; see :class:`stereobench.methods.methods.Matcher`."""
+    """A network with its weights as a method; see :class:`stereobench.methods.matcher.Matcher`."""
 
     def __init__(
         self,

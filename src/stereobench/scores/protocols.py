@@ -14,7 +14,7 @@ exact-2026   synthetic cities against their exact truth: all pixels that both vi
 ===========  ======================================================================================
 
 In all of them the pixels of all tiles are pooled, and what a method leaves invalid is filled along
-the row from the lower of its two sides (:mod:`.holes`) and counts.
+the row from the lower of its two sides (:func:`.scores.fill_holes`) and counts.
 """
 
 from __future__ import annotations

@@ -169,12 +169,12 @@ def align(
     """Correct the RPCs of a pair by ground control points.
 
     ``model``: affine (6 parameters per image, at least 4 GCPs), similarity (4; 3) or shift (2; 2).
-    A GCP is left out of a view if its studentised residual exceeds :data:`BLUNDER_FLOOR` px and 4.5
-    times the GCPs' robust deviation; up to a third of a view's GCPs. ``names`` of both images in
-    the images sheet are what control points of the long form name. ``seed`` is for the samples
-    among more than 23 GCPs. ``epoch``: of the city's places, see :func:`.control_points.read_gcps`.
-    The result does not depend on the order of the GCPs. ``strict`` makes
-    warnings errors.
+    A GCP is left out of a view if its studentised residual exceeds
+    :data:`.gcp_checks.BLUNDER_FLOOR` px and 4.5 times the GCPs' robust deviation; up to a third of
+    a view's GCPs. ``names`` of both images in the images sheet are what control points of the long
+    form name. ``seed`` is for the samples among more than 23 GCPs. ``epoch``: of the city's places,
+    see :func:`.control_points.read_gcps`. The result does not depend on the order of the GCPs.
+    ``strict`` makes warnings errors.
 
     Raises InputError, naming scene, file and remedy: unreadable input, GCPs outside the images or
     elsewhere on the Earth, left and right swapped, too few or collinear GCPs for the model (naming

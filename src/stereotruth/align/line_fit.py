@@ -155,7 +155,8 @@ def _left(equations: Equations, lines: LineFit, design: Floats) -> Floats:
 
 
 def _likelihood(equations: Equations, expected: Floats, lines: LineFit, design: Floats) -> float:
-    """Logarithm of that of tie points among blunders of any size, as in :func:`.estimate`."""
+    """Logarithm of that of tie points among blunders of any size, as in
+    :func:`.adjustment.estimate`."""
     scale = np.hypot(expected, START_PX)
     squares = np.sum(_left(equations, lines, design) ** 2, axis=1) / scale**2
     return float(np.log1p(BLUNDER_ODDS * np.exp(-squares / 2.0) / scale**2).sum())

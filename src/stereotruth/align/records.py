@@ -66,7 +66,7 @@ class Equations:
 class PlanObservation:
     """The place of an image in plan, in px of (col, row): observed = design @ parameters + error.
 
-    ``design`` [2, 6] of the parameters of :func:`.adjustment.parameters_of`, ``observed`` [2],
+    ``design`` [2, 6] of the parameters of :func:`.alignment.parameters_of`, ``observed`` [2],
     ``covariance`` [2, 2] px² of the image's own error; ``px_per_m`` [2, 2]: by what a metre to the
     east and to the north moves a place, and so the error that all images have in common.
     """
@@ -81,7 +81,7 @@ class PlanObservation:
 class PairEquations:
     """What the tie points of a pair say of its images, whatever alignment they were found with.
 
-    ``equations``: of the parameters [12] of :func:`.adjustment.parameters_of` of both images, left
+    ``equations``: of the parameters [12] of :func:`.alignment.parameters_of` of both images, left
     first.
     ``start`` [12]: those of the alignment by control points or RPCs; ``linearised_at`` [12]: those
     with which the tie points were matched. ``places``: where the images were compared, with and
@@ -222,11 +222,12 @@ def covariance_of(site: Mapping[str, Any], names: Sequence[str]) -> Floats:
 
 
 def pair_alignment(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
-    """The record of :class:`.Alignment` of a pair by its images' adjusted corrections, JSON-ready.
+    """The record of :class:`.alignment.Alignment` of a pair by its images' adjusted corrections,
+    JSON-ready.
 
-    ``site``: what :func:`adjust_site` found, or an earlier one that has both images. Of a pair
-    whose image is refused it has the sentence ``refused`` alone, which :meth:`.Alignment.read`
-    raises.
+    ``site``: what :func:`.site_adjustment.adjust_site` found, or an earlier one that has both
+    images. Of a pair whose image is refused it has the sentence ``refused`` alone, which
+    :meth:`.alignment.Alignment.read` raises.
     """
     figures = [site["images"][name] for name in scene.names]
     for name, image in zip(scene.names, figures):

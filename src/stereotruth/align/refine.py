@@ -1,7 +1,7 @@
 """Automatic refinement of an alignment: what is left between LiDAR and the two images is removed.
 
 GCPs of 0.25 px leave 0.1 to 0.25 px of y-parallax and of difference between the disparities of
-LiDAR and images. Hundreds of tie points (see ``tie_points``) see this relative error directly. What
+LiDAR and images. Hundreds of tie points (:mod:`.tie_points`) see this relative error directly. What
 both images have in common they see on slopes only, as LiDAR strips are co-registered by their
 heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
 both affines are estimated together, the GCP fits and their covariance being the prior: tie points
@@ -150,7 +150,7 @@ def _record(
 @dataclass(frozen=True, eq=False)
 class _Found:
     """What tie points tell: the estimate, errors that it shares, lines, the refined alignment,
-    :func:`agreement_of_halves`, and what all of it means for labels."""
+    :func:`.adjustment.agreement_of_halves`, and what all of it means for labels."""
 
     observations: Observations
     estimate: Estimate
@@ -167,7 +167,8 @@ def _search(
     stores: Sequence[PointStore],
     prior: Floats,
 ) -> _Found | str:
-    """Tie points, estimate, refined alignment and :func:`agreement_of_halves`; or why not."""
+    """Tie points, estimate, refined alignment and :func:`.adjustment.agreement_of_halves`; or why
+    not."""
     sizes = sources[0].size, sources[1].size
     rows = sizes[0][1], sizes[1][1]
     parameters, by_line = np.zeros(12), np.zeros(LINE_UNKNOWNS)

@@ -165,7 +165,7 @@ def surface_correlation(
     """Correlation of two images [h, w] over the pixels of each pixel's surface in its window.
 
     Of these, the ``clear`` [h, w] ones alone where that is given; of the pixels of ``runs``
-    (:func:`wanted_runs`) alone where these are.
+    (:func:`.window_sums.wanted_runs`) alone where these are.
 
     ``warped`` is NaN and ``disparity`` (px), with its ``slope`` [2, h, w] along x and y, anything
     where there is no label. NaN where there is no label or fewer pixels than the ``window`` (odd,
@@ -228,7 +228,7 @@ def alike_correlation(
     the share ALIKE or by NOISY standard deviations of the noise. ``left`` is 0 and ``warped`` NaN
     where an image has no value. The coefficient is as it would be without ``noise`` (variances of
     both images), 1 at most. NaN with fewer than LEAST_ALIKE, and where noise leaves so little that
-    chance may do as well. Of the pixels of ``runs`` (:func:`wanted_runs`) alone.
+    chance may do as well. Of the pixels of ``runs`` (:func:`.window_sums.wanted_runs`) alone.
     """
     known = np.isfinite(brightness[1]) & np.isfinite(disparity) & (left != 0.0)
     bright = _bright(brightness, ALIKE, noise)
@@ -273,7 +273,7 @@ def surface_means(
     ``reach`` px off count, one of so many (``every``) along each axis, if they have a value. Those
     rows do whose number in the grid is a multiple of ``every``, so that values of others need not
     be known; ``first_row``: number of the first of the rows. Of the pixels of ``runs``
-    (:func:`wanted_runs`) alone where these are given.
+    (:func:`.window_sums.wanted_runs`) alone where these are given.
     """
     if runs is None:
         runs = wanted_runs(np.isfinite(disparity))

@@ -118,7 +118,7 @@ class LabelledWindow:
 
     def correlation(self, window_px: int) -> tuple[Singles, Singles]:
         """Of both images over each pixel's surface, and the one expected of the same ground, see
-        :func:`.correlation_and_expected`; NaN where a pixel is not labelled."""
+        :func:`.surface_windows.correlation_and_expected`; NaN where a pixel is not labelled."""
         runs = wanted_runs(self.labelled)
         of_runs = correlation_and_expected(
             *self.images, *self.surface, window_px, self.noise, self.clear, runs

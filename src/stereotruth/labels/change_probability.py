@@ -71,7 +71,7 @@ def trees(diachronic: bool) -> list[DecisionTrees]:
 class ChangeProbability(NamedTuple):
     """What the images of a window tell of its pixels [h, w]: the ``probability`` that what a
     labelled one shows has changed, and which figures of the evidence lie ``beyond`` what was
-    learned, see :func:`.beyond_learned`, 0 where the images agree closely."""
+    learned, see :func:`.change_evidence.beyond_learned`, 0 where the images agree closely."""
 
     probability: Floats
     beyond: NDArray[np.uint32]

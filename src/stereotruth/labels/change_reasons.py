@@ -1,6 +1,6 @@
 """What has changed where images and LiDAR show different surfaces: the layer ``change``.
 
-Each pixel of status ``changed`` gets a reason (:class:`.reason.Reason`). What stood there at the
+Each pixel of status ``changed`` gets a reason (:class:`.status.Reason`). What stood there at the
 LiDAR's date its class says; what stands there in the images the shift says at which these agree
 better, and the size of the patch that has changed:
 

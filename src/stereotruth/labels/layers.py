@@ -222,10 +222,10 @@ def _uncertainty(settings: LabelSettings) -> dict[str, str]:
 class LidarLabels(NamedTuple):
     """Labels of a window before its images are compared; arrays [h, w] of the types of LIDAR_TYPES.
 
-    Of :class:`.WindowLabels`: ``status``, ``disparity``, slope along x and y, ``variance``,
-    ``height``, ``surface_class``, ``day``, ``point_count``. ``is_rough``: 1 where a rough surface
-    may be seen. Of each pixel's own points: height of the ``highest`` (m, NaN for none) on the
-    surface that the centre sees, and its class.
+    Of :class:`.pair_window.WindowLabels`: ``status``, ``disparity``, slope along x and y,
+    ``variance``, ``height``, ``surface_class``, ``day``, ``point_count``. ``is_rough``: 1 where a
+    rough surface may be seen. Of each pixel's own points: height of the ``highest`` (m, NaN for
+    none) on the surface that the centre sees, and its class.
     """
 
     status: Bytes

@@ -200,7 +200,8 @@ class PairWindow:
 
     def of_equal_noise(self, noise: tuple[NoiseCurve, NoiseCurve]) -> PairWindow:
         """With brightness counted in standard deviations of the images' ``noise``, see
-        :meth:`.NoiseCurve.equalised`: :data:`.image_noise.EQUAL` are its variances then."""
+        :meth:`.image_noise.NoiseCurve.equalised`: :data:`.image_noise.EQUAL` are its variances
+        then."""
         left, right = (
             replace(patch, pixels=curve.equalised(patch.pixels))
             for patch, curve in zip((self.left, self.right), noise)
@@ -266,7 +267,7 @@ class Labels:
 class WindowLabels:
     """Labels of a window and why its other pixels have none; arrays [h, w].
 
-    ``status`` (:class:`.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
+    ``status`` (:class:`.status.Status`); ``labels``: disparity, slope, variance; ``height`` (m) and
     ``surface_class`` (ASPRS) of what a pixel shows; ``day``: when that was measured, since
     1970-01-01, 0 for not known; ``point_count``: points used.
     """

@@ -1,6 +1,6 @@
 """Labels of the visible facets, and of the points that pixels have themselves.
 
-Points are added up pixel by pixel while they are read (:func:`own_points`), against the facet that
+Points are added up pixel by pixel while they are read (:class:`OwnPoints`), against the facet that
 the pixel's centre sees, so that none of them is kept. Where a pixel's points on this facet are the
 surer ones, they are the label: a plane through the means of its points and those of its neighbours
 on the same surface takes the disparity at the centre. No bias by the largest of several noisy

@@ -314,8 +314,8 @@ def project_scene(
 ) -> dict[str, Any] | None:
     """Project the points of a scene and write its disparity grid; returns the summary.
 
-    ``inputs``: see :meth:`.SceneInputs.of`. ``code``: digest of the source, for the provenance.
-    ``scheduler`` is what Dask's compute takes; ``workers`` the number of its threads.
+    ``inputs``: see :meth:`.scene_inputs.SceneInputs.of`. ``code``: digest of the source, for the
+    provenance. ``scheduler`` is what Dask's compute takes; ``workers`` the number of its threads.
 
     Blocks that an earlier call has left, made of the same, are taken over (see
     :mod:`stereotruth.core.products.resumable_grids`). ``strip``: make its blocks only, for a later

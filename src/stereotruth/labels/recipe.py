@@ -52,7 +52,7 @@ Layers = dict[str, NDArray]
 
 def label_window(scene: SceneInputs, rows: slice, cols: slice) -> tuple[Layers, Counts] | None:
     """All layers of a window by itself and its counts, see :func:`image_layers` and
-    :func:`.paper_layers`; None if it has no points."""
+    :func:`.paper_recipe.paper_layers`; None if it has no points."""
     if not scene.on_surface:
         return paper_layers(scene, rows, cols)
     around = labels_around(scene, rows, cols)

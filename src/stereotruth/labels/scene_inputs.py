@@ -107,8 +107,8 @@ class SceneInputs:
     def in_light(
         self, diachronic: bool | None, cells: Mapping[str, tuple[str, float | None, float | None]]
     ) -> SceneInputs:
-        """The same with ``settings.diachronic`` as :func:`.pair_light` decides it: by what the
-        scenes sheet says of ``diachronic``, and by date and sun of both images.
+        """The same with ``settings.diachronic`` as :func:`.site_pairs.pair_light` decides it: by
+        what the scenes sheet says of ``diachronic``, and by date and sun of both images.
 
         ``cells`` by view: acquired, sun_azimuth and sun_elevation of the images sheet (empty
         and None where it has none), which go before the delivery.

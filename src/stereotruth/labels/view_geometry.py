@@ -224,7 +224,8 @@ class Pair:
         return cols
 
     def alignment_variance(self, x: Floats, y: Floats, slope: Floats) -> Floats:
-        """px² [rows, cols] at columns ``x`` and rows ``y``; see :class:`LabelUncertainty`."""
+        """px² [rows, cols] at columns ``x`` and rows ``y``; see
+        :class:`.label_uncertainty.LabelUncertainty`."""
         return self.uncertainty.variance(x, y, slope)
 
     def arrays(self, arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:

@@ -276,7 +276,7 @@ def _ranges(x: Ints, y: Ints, h: Ints, low: Ints, high: Ints) -> None:
 def blocks_in_view(
     blocks: Sequence[Block], model: ViewGeometry, first: tuple[int, int], shape: tuple[int, int]
 ) -> tuple[Block, ...]:
-    """Of the ``blocks`` around a window, those that hold a square of :func:`window_points`.
+    """Of the ``blocks`` around a window, those that hold a square of :func:`ground_in_view`.
 
     The box around the ground of a turned window holds up to twice as many. One at least, if there
     are any, since a window may have points and no surface.

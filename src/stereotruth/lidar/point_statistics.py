@@ -82,7 +82,7 @@ def roughness_m(stores: Sequence[PointStore]) -> float | None:
     Mean step between the highest points of neighbouring squares of SQUARE_M, m, where these are
     measured from the plane of the ground. None if too few squares hold points. What stands up looks
     different from its sides and casts shadows, so that this tells how well images of a site match:
-    :mod:`stereotruth.sensor.pair_quality`.
+    :mod:`stereotruth.sensor.site_pairs`.
 
     MOST_CELLS cells of the point stores are read, evenly spread. The order of the stores plays no
     part.

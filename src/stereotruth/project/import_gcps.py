@@ -80,7 +80,7 @@ def import_gcps(
     """Write ``to`` from the files of another program; returns what was done, line by line.
 
     Points of a system whose frame is known to centimetres keep it, and ``to`` says it in its first
-    lines, as ``epoch`` of the coordinates where it is given (:mod:`..alignment.control_points`).
+    lines, as ``epoch`` of the coordinates where it is given (:mod:`..align.control_points`).
     Heights of rasters and geoids are brought to that frame.
 
     Raises InputError that names file and line; nothing is written then.

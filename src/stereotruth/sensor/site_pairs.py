@@ -10,8 +10,8 @@ between them (docs/explanation/real_sensors.md).
 Pairs rank by the information about heights that a pixel is expected to give: the share of pixels
 that can be matched, times ½ log₂(1 + (RELIEF_M / height_sigma_m)²) bits (Shannon 1949). The log
 odds of a match fall with the base over the height, with the way of the shadows and with the
-roughness of the site (:func:`stereotruth.lidar.roughness.roughness_m`), as far as its LiDAR has
-been read. The coefficients are fitted and tested on other sites by ``bench/pairs.py``
+roughness of the site (:func:`stereotruth.lidar.point_statistics.roughness_m`), as far as its LiDAR
+has been read. The coefficients are fitted and tested on other sites by ``bench/pairs.py``
 (docs/stack.md).
 """
 

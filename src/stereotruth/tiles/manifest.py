@@ -1,7 +1,7 @@
 """The manifest of a folder of tiles or of a dataset: a line per pair, and its one reader.
 
 What a line states becomes names of files. It may come from somebody else, so that every line is
-held to plain names, and to paths below the manifest's folder (:mod:`..core.products.names`).
+held to plain names, and to paths below the manifest's folder (:mod:`..core.products.files`).
 
 Beside its labels, a tile has the layers that a user asks for, on the grid of the left image:
 

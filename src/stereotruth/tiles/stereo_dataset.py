@@ -161,7 +161,8 @@ class StereoDataset:
 def find_pairs(root: str | Path, layout: str) -> list[Pair]:
     """All pairs below a folder, sorted by split and name.
 
-    Names and cities of pairs are plain names (:mod:`..products.names`), whoever made the dataset.
+    Names and cities of pairs are plain names (:mod:`..core.products.files`), whoever made the
+    dataset.
 
     Raises InputError if the folder or a file of a pair is missing, if nothing there has the
     layout's names, if two pairs of one split have one name, or if a name is no plain one.

@@ -64,8 +64,9 @@ def sigma_by_surface(counts: NDArray[np.int64]) -> dict[str, dict[str, Any]]:
 class TileChecks:
     """What its images say about a labelled tile: class, SIFT matches, sums of image warping.
 
-    ``surface``, ``sigma`` of each match: what its label lies on (:class:`.LabelSurface`), and the
-    uncertainty (px) that it states; ``stated``: of all labels, see :func:`count_sigma`.
+    ``surface``, ``sigma`` of each match: what its label lies on
+    (:class:`.label_surfaces.LabelSurface`), and the uncertainty (px) that it states; ``stated``: of
+    all labels, see :func:`count_sigma`.
     """
 
     kind: str

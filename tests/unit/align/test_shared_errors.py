@@ -26,7 +26,8 @@ OFF_M = np.array([1.9, -1.3])  # by which both RPCs place the ground wrongly, ea
 
 
 def misplaced(sensor: SensorModel, metres: np.ndarray) -> np.ndarray:
-    """[2, 3] of :func:`start`: the error in px of a camera that is off by ``metres`` in plan."""
+    """[2, 3] of :func:`.textured_pair.start`: the error in px of a camera that is off by ``metres``
+    in plan."""
     shift = plan_slopes(sensor, LON, LAT, HEIGHT) @ metres
     return np.column_stack([np.zeros((2, 2)), shift])
 
