@@ -36,7 +36,6 @@ from .adjustment import (
 from .records import Equations
 from .shared_errors import WIDEST, Steps, amount, climb
 
-Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 

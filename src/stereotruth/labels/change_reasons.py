@@ -31,7 +31,6 @@ from .change_evidence import WINDOW_PX, LabelledWindow
 from .shifted_agreement import WIDE_SHIFTS_PX, shifted_agreement
 
 Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 

@@ -43,7 +43,6 @@ from .pair_window import Labels, PairWindow, WindowLabels, merged_status
 from .view_geometry import PixelScale
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Steps = NDArray[np.int32]
 

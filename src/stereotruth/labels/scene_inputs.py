@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..align.alignment import Alignment
 from ..align.label_uncertainty import LabelUncertainty, with_strips
@@ -47,7 +46,6 @@ from .window_points import Footprint, PointWindows, blocks_in_view
 
 log = logging.getLogger("stereotruth")
 
-Bools = NDArray[np.bool_]
 
 EDGE = 33  # places along each side of a frame
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..core.kernels import inlined, inner, kernel
 from .scale import PART, PART_BITS, SQUARE_CELLS, SquareGrid, SurfaceScale, height_steps
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 

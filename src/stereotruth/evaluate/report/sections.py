@@ -36,7 +36,6 @@ from .city_pictures import calibration
 Rows = Sequence[Mapping[str, str]]
 Record = Mapping[str, Any]
 Records = Mapping[str, Record]
-Row = Mapping[str, str]
 
 # Table 4 of the paper: (city, class), pairs, matches, mean of mean errors and of mean absolute
 # errors in px.
