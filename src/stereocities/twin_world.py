@@ -46,6 +46,8 @@ POINTS_A_CHUNK = 2_000_000
 TONE = 2.2  # exponent of the tone curve of colours
 MIDDLE = 0.25  # reflectance of a point of median intensity
 DARKEST, BRIGHTEST = 0.04, 0.75  # reflectance
+ROOF_LIGHT = 0.1, 0.5  # reflectance of roofs where the points tell none
+GROUND_M = 0.7  # one point of the ground at most in a square of this side paints it
 GIVE_CRS = "give the coordinate system of the points, as --crs EPSG:2154"
 
 MARGIN_PX = 30  # of the left image around the points
@@ -152,12 +154,6 @@ def _tint(echo: np.ndarray, grey: np.ndarray) -> np.ndarray | None:
         scaled = MIDDLE * echo.astype(np.float64) / max(float(np.median(echo)), 1.0)
         return np.clip(scaled, DARKEST, BRIGHTEST).astype(np.float32)
     return None
-
-
-log = logging.getLogger("stereotruth")
-
-ROOF_LIGHT = 0.1, 0.5  # reflectance of roofs where the points tell none
-GROUND_M = 0.7  # one point of the ground at most in a square of this side paints it
 
 
 def place_of(city: CitySpec, empty: Surfaces) -> tuple[Surfaces, Crowns]:

@@ -31,6 +31,7 @@ FOLDER = "folder"
 # keys of an entry that change no result
 TOLD = ("label", "fine_tuned_of", "licence", "version", "trained_on")
 MOVED = ("polarity", "outside")  # of any kind
+PATHS = ("weights", "folder", "pipeline", "function")  # settings that name a file
 ENTRY_POINTS = "stereotruth.methods"
 MCCNN = "mccnn"  # the pipeline of Pandora that has this name in the place of a file
 MCCNN_MODULES = ("mc_cnn", "pandora_plugin_mc_cnn", "torch")
@@ -260,9 +261,6 @@ KINDS = {
     FOLDER: Kind(settings=("folder",), files=_results),
 }  # fmt: skip
 NETWORKS = tuple(name for name, kind in KINDS.items() if kind.is_network)
-
-
-PATHS = ("weights", "folder", "pipeline", "function")  # settings that name a file
 
 
 def kind_of(name: str, settings: Mapping[str, Any]) -> Kind:

@@ -4,10 +4,9 @@ Weights made by Keras must give the same results here, hence Keras' conventions:
 strided convolution puts the odd row and column at the end, batch normalisation has an epsilon of
 1e-3 and keeps 99 % of its statistics at each step, kernels start from He's normal distribution.
 
-The gradient of two-dimensional convolutions with respect to their kernels, on a CPU.
-
-oneDNN takes 5 to 13 times as long for it as for the convolution itself where the image is large
-and the kernel is spread (AVX2, float32); as products of matrices it takes twice as long.
+For the gradient of a convolution by its kernel, on a CPU, oneDNN takes 5 to 13 times as long as for
+the convolution itself where the image is large and the kernel is spread (AVX2, float32). So that
+gradient is computed here, as products of matrices (:func:`kernel_gradient`): twice as long.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """A method over the pairs of a dataset: a folder of disparity maps, with the time of each.
 
 ``<pair>.tiff`` is float32, NaN where the method gives no disparity; ``uncertainty/<pair>.tiff`` is
-its standard uncertainty in px, of methods that state one. ``predictions.json`` says how
-they were made, the seconds of each pair (the first pair that a process works on is matched twice,
-and only the second time counts), and the memory of the process at its peak. Programs of their own
-(kind ``command``) measure themselves, with their start, and nothing is matched twice.
-``machine`` is the one of the last call.
+its standard uncertainty in px, of methods that state one. ``predictions.json`` says what the method
+is (:func:`identity`), how they were made, the seconds of each pair (the first pair that a process
+works on is matched twice, and only the second time counts), and the memory of the process at its
+peak. Programs of their own (kind ``command``) measure themselves, with their start, and nothing is
+matched twice. ``machine`` is the one of the last call.
 
 Pairs stay in a work folder (hard links) with a record of what they were made of, images and
 method, so that a later call carries on where one was killed, and takes over what it would make the

@@ -1,5 +1,4 @@
-"""What others have published of methods, to stand beside one's own scores, and what is known of
-the training of methods.
+"""What others have published of methods, beside one's own scores; what methods were trained on.
 
 The paper's results (section V) are on the real WHU-Stereo, by methods trained on it. EPE in px, D1
 (3 px) in percent, milliseconds per pair of 1024 × 1024 px; keys are kinds of methods. Protocols of
@@ -74,6 +73,16 @@ INVALID = "how pixels that SGM leaves invalid count, SGM's settings"
 LITTLE = "pair list, range, mask, pooling; whether trained and scored by one program"
 ORDER = f"{LITTLE}; the networks are taken to stand in the order of those of WHU-Stereo"
 
+# What methods learnt from.
+NOTHING = "nothing"
+NOT_STATED = "not stated"
+US3D = "US3D"  # the Data Fusion Contest of 2019
+TRAINING_COLUMNS = {
+    "trained_on": "trained on",
+    "licence": "licence",
+    "seen_in_training": "dataset seen in training",
+}
+
 
 @dataclass(frozen=True)
 class Published:
@@ -109,15 +118,6 @@ PUBLISHED = {
 
 
 # --------------------------------------------------------------------- what methods learnt from
-
-NOTHING = "nothing"
-NOT_STATED = "not stated"
-US3D = "US3D"  # the Data Fusion Contest of 2019
-TRAINING_COLUMNS = {
-    "trained_on": "trained on",
-    "licence": "licence",
-    "seen_in_training": "dataset seen in training",
-}
 
 
 def training_data(of: Mapping[str, Any]) -> dict[str, str]:

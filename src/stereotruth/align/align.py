@@ -304,8 +304,8 @@ def from_rpcs(
 ) -> Alignment:
     """The start of a refinement without ground control points: the RPCs as they are.
 
-    Their covariance is that of RPC_SHIFT and RPC_TILT; the reference height is the middle of the
-    RPCs' own heights. Raises InputError for unreadable images.
+    Their covariance is that of :func:`.alignment.rpc_prior`; the reference height is the middle of
+    the RPCs' own heights. Raises InputError for unreadable images.
     """
     of = f" (scene {scene})" if scene else ""
     sensors, fits = [], []

@@ -76,7 +76,8 @@ class ViewFit:
     ``size`` (cols, rows) of the image; ``sigma0`` px per coordinate, from the redundancy of the
     fit (NaN without any); ``covariance`` float64[6, 6] in px² of the affine's parameters in
     normalised coordinates (u, v) = ((col, row)_rpc − origin) / scale, in the order
-    col: u, v, 1, row: u, v, 1 (few redundant GCPs may agree by chance: see CAREFUL_SIGMA).
+    col: u, v, 1, row: u, v, 1 (few redundant GCPs may agree by chance: see
+    :data:`.align.CAREFUL_SIGMA`).
     """
 
     view: str

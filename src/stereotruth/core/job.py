@@ -1,4 +1,7 @@
-"""Logging and error reporting of one job: the same lines on the terminal and in its log file."""
+"""One job: its log and errors, its progress, work in a process of its own, Dask's scheduler.
+
+Terminal and log file have the same lines.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,4 @@
-"""How good labels are. In: labels, images, exact truth, check points. Out: figures and tables."""
+"""How good labels and surface models are. In: these, images, exact truth. Out: figures, pages.
+
+Also tiles with exact labels.
+"""

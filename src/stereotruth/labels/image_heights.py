@@ -3,8 +3,8 @@
 One image is enough: of the facets that lie on a pixel's ray, the image shows the highest. The
 surface is that of :mod:`stereotruth.surface.surface`, as for the labels of a pair; where an
 undecided triangle may be higher on the ray, the pixel has no height, unless the tops of a crown lie
-there (:mod:`.crowns`). Multi-view stereo, radiance
-fields and splatting work on the originals, which no rectification has touched.
+there (:mod:`.crowns`). Multi-view stereo, radiance fields and splatting work on the originals,
+which no rectification has touched.
 
 The facets' vertices are projected as (col, row, col - disparity, row), with the disparity that a
 height has in the pair of BASE_OVER_HEIGHT, by which all tolerances of the surface count.

@@ -1,1 +1,4 @@
-"""Stage ingest. In: LAS, LAZ or COPC files, their CRS, a geoid. Out: point stores."""
+"""Stage ingest. In: points or rasters of heights, their CRS, a geoid. Out: point stores.
+
+Also what the strips of a site are off, and catalogues of tiles.
+"""

@@ -2,8 +2,7 @@
 
 Disparities are drawn in ``DISPARITIES``, errors in ``ERRORS``, differences in ``DIFFERENCES``: what
 is judged minus what it is judged by, red below and blue above. These maps of colours tell without
-red and green. Pixels without a value are light
-grey.
+red and green. Pixels without a value are light grey.
 """
 
 from __future__ import annotations

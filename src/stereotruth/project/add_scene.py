@@ -1,4 +1,4 @@
-"""A scene's row from a delivery: images, RPCs and views found, LiDAR looked at, sheets written."""
+"""Scenes in the sheets: a row from a delivery (images, views, LiDAR), rows listed and removed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The LiDAR of a scene by its headers."""
+"""The LiDAR of a scene before its run: by its headers, and strips against each other."""
 
 from __future__ import annotations
 

@@ -15,6 +15,9 @@ from rich.table import Table
 from ..core.errors import InputError, told_by_system
 from ..core.tables import SheetError
 
+HEADINGS = ("project", "images", "run")  # of findings that are of no scene
+WIDTH = 160  # where the output is no terminal
+
 
 class Level(Enum):
     """What a finding means for a run."""
@@ -92,8 +95,6 @@ class _Listener(logging.Handler):
 
 
 STYLES = {Level.FACT: "green", Level.DOUBT: "yellow", Level.ERROR: "bold red"}
-HEADINGS = ("project", "images", "run")  # of findings that are of no scene
-WIDTH = 160  # where the output is no terminal
 
 
 def said_once(every: Sequence[Findings]) -> list[tuple[str, list[Finding]]]:

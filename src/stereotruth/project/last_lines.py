@@ -12,6 +12,9 @@ from stereobench.scores.score_method import describe
 
 from ..evaluate.surface_models.score import describe as describe_surface_model
 
+REFUSED = re.compile(r"ERROR (.*?: error: .*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)")
+DEFECT = re.compile(r"ERROR (.*?: unexpected failure)\n((?:(?!\d{4}-\d\d-\d\d ).*\n?)*)")
+
 
 def last_lines(products: Iterable[str]) -> list[str]:
     """What to say of products, in the order of the workflow; without figures only where they are.
@@ -132,10 +135,6 @@ SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
     r"results/predict/.*_dsm\.tif": _look,
     r"score_dsm/[^/]+/([^/]+)/([^/]+)": _surface_model,
 }
-
-
-REFUSED = re.compile(r"ERROR (.*?: error: .*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)")
-DEFECT = re.compile(r"ERROR (.*?: unexpected failure)\n((?:(?!\d{4}-\d\d-\d\d ).*\n?)*)")
 
 
 def complaints(snakemake_logs: Iterable[str]) -> str:

@@ -15,6 +15,8 @@ import typer
 from .. import __version__
 from ..core.errors import InputError, told_by_system
 
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
 
 def examples(*lines: str) -> str:
     """What stands at the end of a command's help, one line each."""
@@ -348,9 +350,6 @@ def pairs(
     listing = list_pairs(city, choice, given, configfile)
     show_pairs(listing.rated, listing.chosen)
     _print(listing.lines)
-
-
-PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
 @app.command(

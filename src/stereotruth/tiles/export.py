@@ -7,7 +7,7 @@ so that no image is resampled again). The tile's disparity is that of the scene 
 Rules for a pair, at its window of the scene's grid:
 
 - complete images: no pixel of the left crop is nodata, the right crop lies inside the right grid
-  and at most ``MAX_RIGHT_NODATA`` of it is nodata;
+  and at most :data:`.scene_stores.MAX_RIGHT_NODATA` of it is nodata;
 - labelled: a share of at least ``min_labelled`` of its pixels has a disparity. Other pairs with
   complete images go under ``unlabelled/``.
 

@@ -150,8 +150,17 @@ class Training(Section):
 
 
 Name = name_of("A-Za-z0-9_-")
-KINDS = ("sgm", "pandora", "stereonet", "psmnet", "hmsmnet", "densemapnet", "function", "command")
-KINDS = (*KINDS, "folder")
+KINDS = (
+    "sgm",
+    "pandora",
+    "stereonet",
+    "psmnet",
+    "hmsmnet",
+    "densemapnet",
+    "function",
+    "command",
+    "folder",
+)
 
 
 def _part_of_training(given: dict[str, Any]) -> dict[str, Any]:

@@ -44,6 +44,8 @@ OFTEN = 10
 LEAST = 10  # cells of an extreme that is none of FILLS: fewer are blunders
 FAR = 50.0  # m or px
 RIMS = np.geomspace(1.0, 1e6, 121)  # bins of differences between neighbours, m or px
+KITTI_STEPS = 256  # in a px of disparity, of PNGs
+MOST_VALUES = 1 << 28  # of an image that is read as a whole: 16384 x 16384 of one band
 MOST_CELLS = 1 << 20  # that are read at once, where the file's blocks allow it
 
 
@@ -304,11 +306,9 @@ def _binned(steps: NDArray[np.floating]) -> NDArray[np.int64]:
     return np.bincount(np.searchsorted(RIMS, steps.ravel()), minlength=RIMS.size + 1)
 
 
-MOST_VALUES = 1 << 28  # of an image that is read as a whole: 16384 x 16384 of one band
 DISPARITY = Quantity(
     "disparity", "disparity map", -np.inf, np.inf, "give one band of disparities in px"
 )
-KITTI_STEPS = 256  # in a px of disparity, of PNGs
 
 
 def write_tiff(

@@ -1,1 +1,1 @@
-"""The page of a city that stands alone: figures, pictures of every tile, tables."""
+"""Pages that stand alone: of a city, of a site, and the index of all."""
