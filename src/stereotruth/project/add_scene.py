@@ -21,6 +21,7 @@ from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from ..lidar.catalogue_list import is_catalogue, write_list
 from ..lidar.lattice import apart, refuse_apart
+from ..sensor.deliveries import OTHERS, VIEWS
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import rpc_file
 from .check_lidar import check_lidar
@@ -32,17 +33,6 @@ from .new_project import append_row, city_row
 from .project import configured, read_rows, sheet, with_stand_ins
 
 SUFFIXES = {".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img"}
-# Names of suppliers (GaoFen-7, ZY-3, Cartosat, ALOS PRISM) for the views along the track, and the
-# plain words.
-VIEWS = (
-    ("left", re.compile(r"(?<![A-Za-z])(BWD|BACKWARD|LEFT)(?![A-Za-z])", re.IGNORECASE)),
-    ("right", re.compile(r"(?<![A-Za-z])(FWD|FORWARD|RIGHT)(?![A-Za-z])", re.IGNORECASE)),
-)
-# What lies beside the images that are wanted: bands of colour, browse images.
-OTHERS = re.compile(
-    r"(?<![A-Za-z])(MUX|MSS?|MULTI|BROWSE|THUMB\w*|QUICKLOOK|PREVIEW|ICON)(?![A-Za-z])",
-    re.IGNORECASE,
-)
 
 
 @dataclass(frozen=True)
