@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-from stereotruth.align.records import ScenePair, write_site
+from stereotruth.align.records import ScenePair
 from stereotruth.align.site_adjustment import adjust_site
+from stereotruth.core.products.files import write_sealed
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, file_sha256
 from stereotruth.lidar.frames import Epoch
@@ -31,4 +32,4 @@ if __name__ == "__main__":
                 inputs, {"epoch": list(snakemake.params.epoch)}, snakemake.params.code
             ),
         )
-        write_site(values, snakemake.output[0])
+        write_sealed(values, snakemake.output[0])

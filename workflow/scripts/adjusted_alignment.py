@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from stereotruth.align.records import ScenePair, pair_alignment, read_site, write_site
+from stereotruth.align.records import ScenePair, pair_alignment, read_site
+from stereotruth.core.products.files import write_sealed
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import checksums, describe, digest
 
@@ -18,4 +19,4 @@ if __name__ == "__main__":
         inputs = checksums([given.alignment, given.equations])
         inputs |= {name: digest(site["images"][name]) for name in pair.names}
         values["provenance"] = describe(inputs, {}, snakemake.params.code)
-        write_site(values, snakemake.output[0])
+        write_sealed(values, snakemake.output[0])

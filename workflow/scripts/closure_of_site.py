@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+from stereotruth.core.products.files import write_sealed
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.products.making import rule_job
 from stereotruth.core.products.provenance import describe, digest, file_sha256
-from stereotruth.evaluate.closure import PairFiles, closure, write_closure
+from stereotruth.evaluate.closure import PairFiles, closure
 
 if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
@@ -22,4 +23,4 @@ if __name__ == "__main__":
             }
             pairs.append(pair)
         values = closure(city, pairs, describe(inputs, {}, snakemake.params.code))
-        write_closure(values, snakemake.output[0])
+        write_sealed(values, snakemake.output[0])

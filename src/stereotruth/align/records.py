@@ -200,18 +200,15 @@ def rpc_alone(fit: ViewFit) -> ViewFit:
 
 
 def read_site(path: str | Path) -> dict[str, Any]:
-    """What :func:`write_site` wrote. Raises InputError if it is damaged or something else."""
+    """What :func:`.site_adjustment.adjust_site` found.
+
+    Raises InputError if it is damaged or something else.
+    """
 
     def checked(values: dict[str, Any]) -> dict[str, Any]:
         return values | {name: values[name] for name in ("images", "pairs", "covariance")}
 
     return read_record(path, checked, what="adjusted images", stage="adjust")
-
-
-def write_site(values: Mapping[str, Any], path: str | Path) -> None:
-    """Write what :func:`.site_adjustment.adjust_site` found, as JSON."""
-    with atomic_file(path) as scratch:
-        scratch.write_text(sealed(values), encoding="utf-8")
 
 
 def covariance_of(site: Mapping[str, Any], names: Sequence[str]) -> Floats:

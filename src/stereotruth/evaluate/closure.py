@@ -29,7 +29,6 @@ from ..align.alignment import Alignment, over_the_image, parameters_of, rpc_prio
 from ..align.records import PairEquations, SiteLines, read_equations
 from ..core.errors import InputError
 from ..core.numerics.interpolation import between_four
-from ..core.products.files import atomic_file, sealed
 from ..core.products.grids import blocks, require_complete
 from ..epipolar.model import EpipolarModel
 
@@ -435,9 +434,3 @@ def _together(found: Sequence[tuple[tuple[str, ...], Floats, Floats]]) -> dict[s
         np.concatenate([none, *(one[1] for one in found)]),
         np.concatenate([none, *(one[2] for one in found)]),
     )
-
-
-def write_closure(values: Mapping[str, Any], path: str | Path) -> None:
-    """Write what :func:`closure` found, as JSON."""
-    with atomic_file(path) as scratch:
-        scratch.write_text(sealed(values), encoding="utf-8")

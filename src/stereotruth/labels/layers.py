@@ -135,11 +135,8 @@ def _status(settings: LabelSettings, view: str, masked: bool) -> dict[str, objec
         "long_name": "why a pixel has a label or none",
         "flag_values": [int(status) for status in statuses],
         "flag_meanings": " ".join(status.label for status in statuses),
-        f"hidden_in_{view}": "no point of the pixel lies on the surface that its centre sees",
         "changed": "LiDAR and images show different surfaces there, or water",
-        "edge_in_pixel": "an edge passes near the centre, or most neighbours carry other surfaces",
-        "precedence": f"frame, {view} view, correlation of points; {other} view, edge, change, "
-        "number of points of pixels",
+        "precedence": "frame, correlation of points, number of points of pixels",
     }
     if settings.recipe == "surface":
         attributes |= {
@@ -147,6 +144,8 @@ def _status(settings: LabelSettings, view: str, masked: bool) -> dict[str, objec
             "from the roughness of its points",
             "edge_in_pixel": "no facet of points, or a height step between points may be nearer to "
             "one of the cameras",
+            "precedence": f"mask, frame, {other} view, edge, own points, points around; then "
+            "crowns of pixels with an edge, and changes of pixels with a label",
         }
     if masked:
         attributes["masked"] = (

@@ -20,7 +20,9 @@ LiDAR decides (:func:`lidar_labels`) follows from what lies close to a pixel, wh
 5. *Layers.* The labels with their uncertainty and status (:mod:`.layers`).
 
 Steps return masks: the first status of :data:`.pair_window.PRECEDENCE` whose mask holds is that of
-the pixel. The recipe paper takes a pixel's label from its own points alone (:mod:`.paper_recipe`).
+the pixel. Masks are merged four times: those of facets; of contours of rough surfaces; of crowns,
+where an edge has left none; of changes, where there is a label. The recipe paper takes a pixel's
+label from its own points alone (:mod:`.paper_recipe`).
 """
 
 from __future__ import annotations

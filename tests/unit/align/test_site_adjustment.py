@@ -19,11 +19,10 @@ from stereotruth.align.records import (
     pair_alignment,
     read_site,
     write_equations,
-    write_site,
 )
 from stereotruth.align.site_adjustment import adjust_site
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.files import write_table
+from stereotruth.core.products.files import write_sealed, write_table
 
 from ...synthetic.cameras import HEIGHT, LAT, LON, camera
 
@@ -119,7 +118,7 @@ def test_one_image_has_one_correction_in_all_of_its_pairs(tmp_path):
     site = adjust_site("Town", made.pairs)
     assert named(site) == {}
     assert worst_error(site, made.truth, NAMES) < 0.25
-    write_site(site, tmp_path / "site.json")
+    write_sealed(site, tmp_path / "site.json")
     assert read_site(tmp_path / "site.json") == site
     affines = {}
     for pair in made.pairs:
@@ -166,7 +165,7 @@ def test_an_image_that_nothing_places_is_refused_and_the_others_are_made(tmp_pat
     for pair in made.pairs:
         record = pair_alignment(site, pair)
         file = tmp_path / pair.scene / "adjusted.json"
-        write_site(record, file)
+        write_sealed(record, file)
         if "D" in pair.names:
             with pytest.raises(InputError, match=f"{pair.scene}: image D: neither.*Remedy: remove"):
                 Alignment.read(file)
@@ -189,7 +188,7 @@ def test_a_later_image_leaves_those_that_are_fixed(tmp_path):
     made = Site(tmp_path)
     first = adjust_site("Town", [pair for pair in made.pairs if "F" not in pair.names])
     kept = tmp_path / "kept.json"
-    write_site(first, kept)
+    write_sealed(first, kept)
     fixed = dict.fromkeys(NAMES[:5], kept)
     later = adjust_site("Town", made.pairs, fixed=fixed)
     for name in NAMES[:5]:

@@ -167,6 +167,12 @@ def sealed(values: Mapping[str, Any]) -> str:
     return json.dumps(text, indent=1, allow_nan=False) + "\n"
 
 
+def write_sealed(values: Mapping[str, Any], path: str | Path) -> None:
+    """A file of :func:`sealed`, whole or absent."""
+    with atomic_file(path) as scratch:
+        scratch.write_text(sealed(values), encoding="utf-8")
+
+
 def read_sealed(path: str | Path) -> dict[str, Any]:
     """What :func:`sealed` was given. Raises InputError if it is not what was written."""
     values, is_as_written = read_perhaps_edited(path)

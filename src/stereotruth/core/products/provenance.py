@@ -19,12 +19,13 @@ from ... import __version__
 
 SOURCES = Path(__file__).parents[3]  # where the packages lie
 PACKAGES = ("stereotruth", "stereobench", "stereocities")
-CONFIG = (
-    "stereotruth.core.config."  # declares keys: what a rule takes of them stands in its parameters
+# Declares keys: what a rule takes of them stands in its parameters.
+CONFIG = "stereotruth.core.config."
+# Their versions may decide bytes of products.
+LIBRARIES = (
+    *("numpy", "scipy", "numba", "opencv-python-headless", "zarr", "numcodecs"),
+    *("rasterio", "pyproj", "laspy", "lazrs"),
 )
-# whose versions may decide bytes of products
-LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless", "zarr", "numcodecs")
-LIBRARIES = (*LIBRARIES, "rasterio", "pyproj", "laspy", "lazrs")
 
 # Pythons differ in their trees.
 CACHE = Path(__file__).parent / "__pycache__" / f"sources-{sys.implementation.cache_tag}.json"
