@@ -206,24 +206,6 @@ def _locate(
 
 
 @inlined
-def _locate_means(sums: Ints, scale: float, key: Ints, u: Floats, v: Floats, w: Floats) -> None:
-    """As :func:`_locate`, of mean points of the points' lattice in its cubes: ``sums`` [n, 4],
-    number of points and sums of their coordinates; nowhere without points.
-
-    Integers as far as they go: what is divided is the same wherever windows begin.
-    """
-    for p in range(len(sums)):
-        n = max(sums[p, 0], 1)
-        side = n << CUBE_BITS
-        i, j, k = sums[p, 1] // side, sums[p, 2] // side, sums[p, 3] // side
-        step = scale / (1 << CUBE_BITS)
-        u[p] = (sums[p, 1] - i * side) / n * step - 0.5 * scale
-        v[p] = (sums[p, 2] - j * side) / n * step - 0.5 * scale
-        w[p] = (sums[p, 3] - k * side) / n * step - 0.5 * scale
-        key[p] = _key(float(i), float(j), float(k)) if sums[p, 0] > 0 else _NOWHERE
-
-
-@inlined
 def _of_patch(
     coefficients: Floats, at: int, u: Floats, v: Floats, w: Floats, rise: bool, out: Floats,
     first: int,
@@ -241,29 +223,24 @@ def _of_patch(
 
 @kernel
 def _evaluate(
-    keys: Ints, coefficients: Floats, lattice: _Lattice, points: tuple[NDArray, ...] | None,
-    sums: Ints | None, rise: bool, out: Floats, missing: Ints,
+    keys: Ints, coefficients: Floats, lattice: _Lattice, points: tuple[NDArray, ...],
+    rise: bool, out: Floats, missing: Ints,
 ) -> int:  # fmt: skip
     """Fill out [outputs, n] with the polynomials, or their slope along z where ``rise``; NaN where
     no patch is usable.
 
     ``keys`` [k] of known patches, sorted; ``coefficients`` [k, outputs, terms]; ``points``: three
-    arrays [n], or None: ``sums`` [n, 4] are given, see :func:`_locate_means`. Returns how many
-    unknown patches were met, each perhaps more than once; their keys are in ``missing``. Then
-    ``out`` is not whole.
+    arrays [n]. Returns how many unknown patches were met, each perhaps more than once; their keys
+    are in ``missing``. Then ``out`` is not whole.
     """
     key, place = np.empty(_BLOCK, np.int64), np.empty((3, _BLOCK))
     unknown = 0
     for start in range(0, out.shape[1], _BLOCK):
         size = min(_BLOCK, out.shape[1] - start)
         u, v, w = place[0, :size], place[1, :size], place[2, :size]
-        alike = False
-        if points is not None:
-            x, y, z = points
-            part = slice(start, start + size)
-            alike = _locate(lattice, x[part], y[part], z[part], key[:size], u, v, w)
-        if sums is not None:
-            _locate_means(sums[start : start + size], lattice.scale, key, u, v, w)
+        x, y, z = points
+        part = slice(start, start + size)
+        alike = _locate(lattice, x[part], y[part], z[part], key[:size], u, v, w)
         i = 0
         while i < size:
             end = size if alike else i + 1
@@ -309,14 +286,12 @@ class _SmoothMap(ABC):
         self._keys = keys[order]
         self._coefficients = np.concatenate([self._coefficients, new])[order]
 
-    def _polynomials(
-        self, points: tuple[NDArray, ...] | None, sums: Ints | None = None, rise: bool = False
-    ) -> Floats:
-        """At the ``points`` or means of :func:`_evaluate`; NaN where no polynomial is good."""
-        count = len(sums) if points is None else points[0].size
-        out, missing = np.empty((len(self._tolerance), count)), np.empty(_AT_ONCE, np.int64)
+    def _polynomials(self, points: tuple[NDArray, ...], rise: bool = False) -> Floats:
+        """At the ``points`` of :func:`_evaluate`; NaN where no polynomial is good."""
+        out = np.empty((len(self._tolerance), points[0].size))
+        missing = np.empty(_AT_ONCE, np.int64)
         known = self._keys, self._coefficients, self._lattice
-        while unknown := _evaluate(*known, points, sums, rise, out, missing):
+        while unknown := _evaluate(*known, points, rise, out, missing):
             self._fit(np.unique(missing[:unknown]))
             known = self._keys, self._coefficients, self._lattice
         return out
@@ -421,14 +396,3 @@ class LocalProjection(_SmoothMap):
         for values, of_axis in zip(rise, slope):
             values[chosen] = of_axis
         return self.at_points(lon_q, lat_q, h_q), rise
-
-    def at_means(self, sums: Ints) -> Floats:
-        """As :meth:`at_points` of mean points; NaN where there are none.
-
-        ``sums`` int64[n, 4]: number of points, sums of their lattice coordinates.
-        """
-        out = self._polynomials(None, sums)
-        bad = np.isnan(out[0]) & (sums[:, 0] > 0)
-        if bad.any():
-            out[:, bad] = self._by_model(*(sums[bad, axis] / sums[bad, 0] for axis in (1, 2, 3)))
-        return out
