@@ -157,9 +157,9 @@ class Character:
     ``relief_m``: height range aimed at over the world; ``valley``: share of it that is plain;
     ``wavelength_m``: that of the largest relief; ``max_slope_deg``: nothing is steeper.
     ``river_m``: width of the river, 0 for none; ``lakes``: depth of depressions below the water
-    level, 0 for none. ``zones``: weight of each land use, see ``zones.ZONE_KINDS``. ``towers_m``:
-    range of heights of high buildings. ``trees``: factor on the number of trees. ``zone_m``: mean
-    distance between the centres of zones. ``canopy``: crowns besides these trees.
+    level, 0 for none. ``zones``: weight of each land use, see :data:`.layout.ZONE_KINDS`.
+    ``towers_m``: range of heights of high buildings. ``trees``: factor on the number of trees.
+    ``zone_m``: mean distance between the centres of zones. ``canopy``: crowns besides these trees.
     ``ground_look``: factors on the ground's reflectance and on its contrast. ``buildings``: share
     of the buildings that are built; ``flat_roofs``: none has a gable. ``vehicles``: per hectare,
     which move between the views and are others in the LiDAR.

@@ -37,8 +37,8 @@ def render(sensor: SensorModel, height: float) -> np.ndarray:
 
 
 def run(folder: Path, left: np.ndarray, right: np.ndarray, sensors=None, **options):
-    """Rectify two arrays, with masks and bands as :func:`open_pair` takes them; returns the model
-    and both images. ``left_tags``, ``right_tags``: of their files."""
+    """Rectify two arrays, with masks and bands as :func:`.images.open_pair` takes them; returns the
+    model and both images. ``left_tags``, ``right_tags``: of their files."""
     sensors, masks = sensors or pair(), options.pop("masks", (None, None))
     source, bands = folder / "source", options.pop("bands", None)
     source.mkdir(exist_ok=True, parents=True)

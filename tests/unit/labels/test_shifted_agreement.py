@@ -57,7 +57,8 @@ def test_wanted_pixels_have_the_values_that_all_together_have(share):
 
 
 def test_correlations_at_all_shifts_are_those_of_the_warped_images() -> None:
-    """Means over the surface of what :func:`surface_correlation` says of each shift by itself."""
+    """Means over the surface of what :func:`.surface_windows.surface_correlation` says of each
+    shift by itself."""
     window = grown(3)
     left, right = (detail.patch for detail in window.details((0.0, 0.0)))
     (top, side), (rows, cols) = window.first, SHAPE

@@ -1,3 +1,5 @@
+"""Images of a site at their own dates and suns: their truth, and control points in the long form."""
+
 from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta

@@ -40,6 +40,19 @@ CHUNK = 256  # px of the result
 
 Pixels = Annotated[Number, Field(gt=0), Unit("px")]
 
+Name = name_of("A-Za-z0-9_-")
+KINDS = (
+    "sgm",
+    "pandora",
+    "stereonet",
+    "psmnet",
+    "hmsmnet",
+    "densemapnet",
+    "function",
+    "command",
+    "folder",
+)
+
 
 class StereoDatasetEntry(Section):
     """An entry of the configuration's benchmark.datasets."""
@@ -147,20 +160,6 @@ class Training(Section):
 
     checkpoint_minutes: Annotated[NotNegative, Unit("min")] = 5
     """a killed training goes on from its last checkpoint, at the latest from the last epoch"""
-
-
-Name = name_of("A-Za-z0-9_-")
-KINDS = (
-    "sgm",
-    "pandora",
-    "stereonet",
-    "psmnet",
-    "hmsmnet",
-    "densemapnet",
-    "function",
-    "command",
-    "folder",
-)
 
 
 def _part_of_training(given: dict[str, Any]) -> dict[str, Any]:

@@ -86,6 +86,9 @@ HEIGHT = Quantity(
     "give a raster of one band of heights (gdal_translate -b N takes one out)",
 )
 MASK = Quantity("pixel of a mask", "mask", 0.0, np.inf, "give a mask of one band")
+DISPARITY = Quantity(
+    "disparity", "disparity map", -np.inf, np.inf, "give one band of disparities in px"
+)
 
 
 def is_value(raw: NDArray[Any], value: float) -> NDArray[np.bool_]:
@@ -304,11 +307,6 @@ class Fills:
 def _binned(steps: NDArray[np.floating]) -> NDArray[np.int64]:
     steps = steps[np.isfinite(steps)]
     return np.bincount(np.searchsorted(RIMS, steps.ravel()), minlength=RIMS.size + 1)
-
-
-DISPARITY = Quantity(
-    "disparity", "disparity map", -np.inf, np.inf, "give one band of disparities in px"
-)
 
 
 def write_tiff(
