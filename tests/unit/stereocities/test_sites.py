@@ -1,4 +1,4 @@
-"""Images of a site at their own dates and suns: their truth, and control points in the long form."""
+"""Images of a site at their own dates and suns: their truth, control points in the long form."""
 
 from __future__ import annotations
 
