@@ -92,6 +92,7 @@ no-python%:
 test-python%: .venv-%/ready
 	PATH="$(CURDIR)/.venv-$*/bin:$$PATH" pytest -n $(AT_ONCE) -m "not slow" $(FILE_TESTS)
 
+.PRECIOUS: .venv-%/ready  # made by way of test-python%: make would remove it
 .venv-%/ready: $(READY)
 	$(call interpreter,$*) -m venv .venv-$*
 	$(BIN)/uv pip install --quiet --python .venv-$*/bin/python --require-hashes -r envs/requirements.lock
