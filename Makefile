@@ -94,7 +94,7 @@ test-python%: .venv-%/ready
 
 .PRECIOUS: .venv-%/ready  # made by way of test-python%: make would remove it
 .venv-%/ready: $(READY)
-	$(call interpreter,$*) -m venv .venv-$*
+	$(BIN)/uv venv --quiet --clear --python $(call interpreter,$*) .venv-$*
 	$(BIN)/uv pip install --quiet --python .venv-$*/bin/python --require-hashes -r envs/requirements.lock
 	$(BIN)/uv pip install --quiet --python .venv-$*/bin/python --no-deps --no-build-isolation -e .
 	touch $@
