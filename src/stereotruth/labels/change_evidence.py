@@ -31,6 +31,7 @@ from ..epipolar.surface_windows import (
 )
 from ..epipolar.window_sums import wanted_runs
 from ..lidar.point_store import VEGETATION_CLASSES
+from ..sensor.image_noise import ROUNDING
 from .pair_window import Labels, PairWindow
 from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
 
@@ -50,7 +51,6 @@ FAR_PX = 8  # steps farther off do not count
 # Pixels around one that its evidence follows from: the windows of details far off
 EVIDENCE_PX = FAR * SURROUNDINGS_PX + WINDOW_PX // 2 + 2
 LEVEL = 500.0  # DN, to which logarithms of brightness refer, so that their squares are small
-ROUNDING = 1.0 / 12.0  # DN²: variance of whole numbers, the least of an image's noise
 # Both images of the same ground differ by noise; by labels that are off by so many px over the
 # brightness of a slope; and by this share of the brightness.
 OFF_PX, OFF_SHARE = 0.1, 0.01

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
-from ..core.products.files import read_record
+from ..core.products.files import damaged_store, read_record
 from .lattice import CELL_BITS, PER_DEG, PER_M, Footprint, apart, cell_key, lattice_box
 from .point_fields import Days, days_by_code
 
@@ -180,9 +180,9 @@ class PointStore:
         try:
             data = (self.path / CELLS).read_bytes()
         except OSError as error:
-            raise self._damaged(CELLS) from error
+            raise damaged_store(self.path, CELLS) from error
         if zlib.crc32(data) != self.attrs["cells_crc32"]:
-            raise self._damaged(CELLS)
+            raise damaged_store(self.path, CELLS)
         cells = np.load(BytesIO(data))
         self.bounds: tuple[float, ...] = tuple(map(float, self.attrs["bounds"]))
         self.count = int(self.attrs["points"]["kept"])
@@ -218,15 +218,8 @@ class PointStore:
                 if right and file.stat().st_size - stream.tell() == size:
                     return stream.tell()
         except Exception as error:  # NumPy reads the header as Python, which fails in many ways
-            raise self._damaged(name) from error
-        raise self._damaged(name)
-
-    def _damaged(self, name: str) -> InputError:
-        return InputError(
-            "damaged: it is not what was written",
-            file=self.path / name,
-            remedy=f"delete {self.path} and run the workflow again",
-        )
+            raise damaged_store(self.path, name) from error
+        raise damaged_store(self.path, name)
 
     @cached_property
     def footprint(self) -> Footprint | None:
@@ -326,7 +319,7 @@ class PointStore:
             file.seek(place)
             data = file.read(2 * count)
         if zlib.crc32(data) != told["crc32"][cell]:
-            raise self._damaged(STRIPS)
+            raise damaged_store(self.path, STRIPS)
         return np.frombuffer(data, "<u2")
 
     def words_of(self, cell: int) -> Words:
@@ -352,7 +345,7 @@ class PointStore:
                 for at in range(begin, last, _PIECE):
                     stored = buffer[: min(_PIECE, last - at)]
                     if file.readinto(stored.data.cast("B")) != stored.nbytes:
-                        raise self._damaged(POINTS)
+                        raise damaged_store(self.path, POINTS)
                     stop = at + len(stored)
                     of = cell
                     while cell < end and self._start[cell] < stop:
@@ -361,7 +354,7 @@ class PointStore:
                         if self._start[cell + 1] > stop:
                             break
                         if found != self._crc32[cell]:
-                            raise self._damaged(POINTS)
+                            raise damaged_store(self.path, POINTS)
                         found, cell = 0, cell + 1
                     cells = slice(of, min(cell + 1, end))
                     bounds = self._start[cells.start : cells.stop + 1]

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
-from ..core.products.files import read_sealed
+from ..core.products.files import damaged_store, read_sealed
 from ..lidar.lattice import LATTICE_DEG
 from .delaunay import height_ranges
 from .scale import PART, PART_BITS, SurfaceScale
@@ -358,9 +358,9 @@ class SurfaceStore:
         try:
             table = (self.path / BLOCKS).read_bytes()
         except OSError as error:
-            raise self._damaged(BLOCKS) from error
+            raise damaged_store(self.path, BLOCKS) from error
         if zlib.crc32(table) != self.attrs["blocks_crc32"]:
-            raise self._damaged(BLOCKS)
+            raise damaged_store(self.path, BLOCKS)
         self._table = np.load(BytesIO(table))
         self._row = {tuple(number): k for k, number in enumerate(self._table["number"].tolist())}
 
@@ -389,13 +389,6 @@ class SurfaceStore:
         inside &= (own[:, 1] <= north) & (own[:, 3] >= south)
         return self._blocks(self._table[inside])
 
-    def _damaged(self, name: str) -> InputError:
-        return InputError(
-            "damaged: it is not what was written",
-            file=self.path / name,
-            remedy=f"delete {self.path} and run the workflow again",
-        )
-
     def _of(self, block: Block) -> NDArray[np.void]:
         return self._table[self._row[block.row, block.col]]
 
@@ -417,9 +410,9 @@ class SurfaceStore:
                 stream.seek(begin)
                 stream.readinto(data)
         except OSError as error:
-            raise self._damaged(name) from error
+            raise damaged_store(self.path, name) from error
         if zlib.crc32(data) != row["crc32"][int(kinds == TRIANGLES)]:
-            raise self._damaged(name)
+            raise damaged_store(self.path, name)
         return _columns(kinds, sizes, data)
 
     def vertices(self, block: Block) -> Columns:

@@ -26,6 +26,16 @@ LONGEST_NAME = 100  # bytes; a file's name has 255, with what is added to it
 RUN = re.compile(r"'*[=+\-@\t\r]")  # begins what spreadsheets take for a formula
 MARK = "'"  # before such texts
 
+
+def damaged_store(store: Path, name: str) -> InputError:
+    """What is said of a file ``name`` of a ``store`` that is not as it was written."""
+    return InputError(
+        "damaged: it is not what was written",
+        file=store / name,
+        remedy=f"delete {store} and run the workflow again",
+    )
+
+
 FOREIGN = (  # what other programs leave beside the files that they open; in lower case
     "*.aux.xml",  # GDAL, QGIS: statistics
     "*.ovr",  # GDAL, QGIS: pyramids
