@@ -2,8 +2,8 @@
 
 Days. LAS files have either seconds of a GPS week, which tell no day, or adjusted standard GPS time:
 seconds since 1980-01-06 less 10⁹ (LAS 1.4 R16, "Global Encoding", bit 0), or less another offset
-that the header of LAS 1.5 names (bit 6). Days are counted from 1970-01-01; 0 stands for none. A point store has a code of 8 bits for the day of each point, 1 + day
-modulo :data:`DAY_CODES`.
+that the header of LAS 1.5 names (bit 6). Days are counted from 1970-01-01; 0 stands for none. A
+point store has a code of 8 bits for the day of each point, 1 + day modulo :data:`DAY_CODES`.
 
 Strips of a flight are told by ``point_source_id``, else by GPS times, where no point was measured
 for a while, else by flags of the edge of a flight line: two edges that follow each other are a line
