@@ -75,5 +75,6 @@ def vantor_text(values: Mapping[str, Any], namespace: str = "") -> str:
     root = f'<isd xmlns="{namespace}">' if namespace else "<isd>"
     return (
         f'<?xml version="1.0" encoding="UTF-8"?>\n{root}<IMD><IMAGE>{image}</IMAGE></IMD>'
+        "<EPH><STARTTIME>2020-10-25T03:10:00.000000Z</STARTTIME></EPH>"
         f"<RPB><SPECID>RPC00B</SPECID><IMAGE>{fields}</IMAGE></RPB></isd>"
     )
