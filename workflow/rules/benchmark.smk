@@ -132,7 +132,6 @@ rule benchmark_tables:
         sources=upstream("benchmark_tables"),
         dataset=lambda w: dataset_entry(w.dataset),
         split=SETTINGS.benchmark.split,
-        seed=SETTINGS.seed,
         code=source_digest("stereobench.scores.compare_methods"),
         templates=templates_of("stereobench/scores/page.html.jinja"),
     message:
