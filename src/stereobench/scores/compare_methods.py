@@ -179,6 +179,7 @@ def _values(
             if any(shown and shown.groups for _, shown in t.shown)
         ],
         "protocol": one_id(methods),
+        "seal": next((of["seal"] for of in methods), ""),
         "what": minus(dataset_in_words(methods)),
         "slider": _slider(pair),
         "errors": Scale.of(ERRORS, "0", f"{panels.ERROR_PX:g} px; blue: no disparity"),
