@@ -58,7 +58,6 @@ WORK = ".work"  # what programs have made, to be carried on
 STEPS = 8  # of a px, in maps of errors
 THUMBNAIL_PX = 112
 TASK = "Stereo Matching of Satellite Images"
-METRIC = "EPE (px)"
 
 
 class BoardDataset(StereoDatasetEntry):
@@ -212,17 +211,24 @@ def _said(error: InputError, place: Path) -> tuple[str, str]:
 # ------------------------------------------------------------------------------- the figures
 
 
-def _figures(table: Table) -> list[str]:
-    """EPE, and D1 at each threshold."""
-    summary = next(iter(table.methods.values()))[0].summary
-    return ["epe_px", *(f"d1_{limit:g}_px_share" for limit in summary["thresholds_px"])]
+def _name(row: Mapping[str, Any]) -> str:
+    """A method by its label and who submitted it."""
+    return f"{row['method']} by {row['by']}"
+
+
+def _titles(rows: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, str, float]]:
+    """Title, format and factor of the figures of the rows: EPE, and D1 at each threshold."""
+    names = rows[0]["figures"] if rows else ("epe_px",)
+    d1 = {name: (f"D1, {name[3:-9]} px (%)", ".2f", 100.0) for name in names if name != "epe_px"}
+    return {"epe_px": ("EPE (px)", ".3f", 1.0), **d1}
 
 
 def _rows(table: Table) -> list[dict[str, Any]]:
     """The methods of a table with all figures, the least EPE first."""
     if not table.methods:
         return []
-    names = _figures(table)
+    limits = next(iter(table.methods.values()))[0].summary["thresholds_px"]
+    names = ["epe_px", *(f"d1_{limit:g}_px_share" for limit in limits)]
     sums = {
         m: {n: [run.sums(n) for run in runs] for n in names} for m, runs in table.methods.items()
     }
@@ -239,7 +245,9 @@ def _rows(table: Table) -> list[dict[str, Any]]:
                 "method": method[0],
                 "by": method[1],
                 "rank": 1 + len(better),
-                "level_with": [" by ".join(o) for o in order if o != method and less[o].level],
+                "level_with": [
+                    other[0] for other in order if other != method and less[other].level
+                ],
                 "seeds": [run.entry.facts.get("seed") for run in runs],
                 "submissions": [run.entry.name for run in runs],
                 **{key: facts[key] for key in ("licence", "trained_on")},
@@ -258,41 +266,28 @@ def _papers_with_code(title: str, boards: Sequence[Mapping[str, Any]]) -> list[d
     """The tables in the layout of sota-extractor's evaluation tables."""
     datasets = []
     for of in boards:
-        names = {METRIC: ("epe_px", 1, ".3f")}
-        names |= {
-            f"D1, {name[3:-9]} px (%)": (name, 100, ".2f")
-            for name in (of["methods"][0]["figures"] if of["methods"] else ())
-            if name != "epe_px"
-        }
-        rows = [
-            {
-                "model_name": row["method"],
-                "paper_title": "",
-                "paper_url": row["links"].get("paper", ""),
-                "paper_date": None,
-                "code_links": [
-                    {"title": row["method"], "url": url}
-                    for name, url in row["links"].items()
-                    if name == "code"
-                ],
-                "model_links": [],
-                "metrics": {
-                    title: format(factor * row["figures"][name]["value"], form)
-                    for title, (name, factor, form) in names.items()
-                },
-            }
-            for row in of["methods"]
-        ]
-        datasets.append(
-            {
-                "dataset": of["dataset"],
-                "description": f"Protocol {of['protocol']}, {in_number(of['pairs'], 'pair')}.",
-                "subdatasets": [],
-                "dataset_links": [],
-                "dataset_citations": [],
-                "sota": {"metrics": list(names), "rows": rows},
-            }
-        )
+        rows = []
+        for row in of["methods"]:
+            code = row["links"].get("code")
+            paper = {"paper_title": "", "paper_url": row["links"].get("paper", "")}
+            rows.append(
+                {
+                    "model_name": row["method"],
+                    **paper,
+                    "paper_date": None,
+                    "code_links": [{"title": row["method"], "url": code}] if code else [],
+                    "model_links": [],
+                    "metrics": {
+                        title: f"{factor * row['figures'][name]['value']:{form}}"
+                        for name, (title, form, factor) in _titles(of["methods"]).items()
+                    },
+                }
+            )
+        metrics = [title for title, *_ in _titles(of["methods"]).values()]
+        about = f"Protocol {of['protocol']}, {in_number(of['pairs'], 'pair')}."
+        more = {"subdatasets": [], "dataset_links": [], "dataset_citations": []}
+        sota = {"metrics": metrics, "rows": rows}
+        datasets.append({"dataset": of["dataset"], "description": about, **more, "sota": sota})
     task = {"task": TASK, "description": title, "subtasks": [], "source_link": None}
     return [{**task, "datasets": datasets}]
 
@@ -321,7 +316,7 @@ def _write(
                 "methods": rows,
             }
         )
-        maps = {row["method"]: _error_maps(site, table, row) for row in rows}
+        maps = [(row["method"], _error_maps(site, table, row)) for row in rows]
         for row in rows:
             badge = _badge(row, len(rows), protocol["id"])
             _text(site / "badges" / f"{row['submissions'][0]}.svg", badge)
@@ -393,35 +388,27 @@ def _ranking(rows: Sequence[Mapping[str, Any]]) -> Shown | None:
     """The methods, the least EPE first."""
     lines = []
     for row in rows:
-        first = rows[0]
-        behind = row["less"].get(f"{first['method']} by {first['by']}")
+        behind = row["less"].get(_name(rows[0]))
         seeds = [str(seed) for seed in row["seeds"] if seed is not None]
+        epe, *d1 = (_interval(row["figures"][n], *how[1:]) for n, how in _titles(rows).items())
         lines.append(
             (
                 value_cell(row["rank"], ".0f"),
                 link_cell(row["method"], f"#{row['submissions'][0]}", best=row["rank"] == 1),
-                Cell(row["by"], row["by"]),
-                _interval(row["figures"]["epe_px"], ".3f"),
+                epe,
                 _interval(behind, "+.3f") if behind else Cell("–", "0"),
                 Cell("\n".join(row["level_with"]) or "–", str(len(row["level_with"]))),
-                *(
-                    _interval(of, ".2f", 100.0)
-                    for name, of in row["figures"].items()
-                    if name != "epe_px"
-                ),
+                *d1,
                 value_cell(min(row["valid_share"]), ".2f", 100),
                 Cell(", ".join(seeds) or "–", str(len(seeds))),
-                *(Cell(row[key], row[key]) for key in ("trained_on", "licence")),
+                *(Cell(row[key], row[key]) for key in ("trained_on", "licence", "by")),
             )
         )
-    d1 = [name for name in (rows[0]["figures"] if rows else ()) if name != "epe_px"]
-    titles = [
-        *("rank", "method", "by", METRIC, "behind the first, px", "level with"),
-        *(f"> {name[3:-9]} px, %" for name in d1),
-        *("valid, %", "seeds", "trained on", "licence"),
-    ]
+    epe, *d1 = (title for title, *_ in _titles(rows).values())
+    first = ("rank", "method", epe, "behind the first, px", "level with")
+    titles = (*first, *d1, "valid, %", "seeds", "trained on", "licence", "by")
     n = len(titles)
-    return Shown.of(titles, lines, (1, 2, 5, n - 3, n - 2, n - 1))
+    return Shown.of(titles, lines, (1, 4, *range(n - 4, n)))
 
 
 def _pairs(rows: Sequence[Mapping[str, Any]]) -> Shown | None:
@@ -429,12 +416,12 @@ def _pairs(rows: Sequence[Mapping[str, Any]]) -> Shown | None:
     lines = []
     for k, row in enumerate(rows):
         for other in rows[:k]:
-            of = Difference(**row["less"][f"{other['method']} by {other['by']}"])
+            of = Difference(**row["less"][_name(other)])
             text = f"{row['method']} less {other['method']}"
             share = value_cell(of.better_share, ".0f", 100)
             said = "level" if of.level else "told apart"
             lines.append((Cell(text, text), _interval(vars(of), "+.3f"), share, Cell(said, said)))
-    return Shown.of(("methods", METRIC, "better on (% of pairs)", ""), lines, (0, 3))
+    return Shown.of(("methods", "EPE (px)", "better on (% of pairs)", ""), lines, (0, 3))
 
 
 def _badge(row: Mapping[str, Any], count: int, protocol: str) -> str:
