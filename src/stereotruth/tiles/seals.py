@@ -122,6 +122,12 @@ def seal_dataset(root: str | Path, pairs: Iterable[Labelled], split: str, to: st
     )
 
 
+def is_shut(root: str | Path) -> bool:
+    """Whether a dataset has labels that are sealed as yet."""
+    seal = Seal.of(root)
+    return seal is not None and not all((Path(root) / name).is_file() for name in seal.files)
+
+
 def open_seal(root: str | Path, labels: str | Path) -> str:
     """Take the sealed files out of the dataset ``labels`` into the copy; what to say of it.
 
