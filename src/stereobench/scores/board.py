@@ -44,8 +44,9 @@ from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
 from .paired import CONFIDENCE, Difference, Sums, difference, read_sums
 from .panels import ERROR_PX, error_picture
-from .prediction_files import read_prediction
+from .prediction_files import hold_against, read_prediction
 from .predictions import predict
+from .protocols import PROTOCOLS
 from .score_method import ScoringPlan, score
 from .scores import Scorer
 from .strata import Products, exact_truth
@@ -57,6 +58,7 @@ SETTINGS = "board.yaml"
 WORK = ".work"  # what programs have made, to be carried on
 STEPS = 8  # of a px, in maps of errors
 THUMBNAIL_PX = 112
+EXACT = [name for name, of in PROTOCOLS.items() if of.truth == "exact"]
 TASK = "Stereo Matching of Satellite Images"
 
 
@@ -99,19 +101,15 @@ class Table:
     products: Products
     pairs: Sequence[Pair]
     plan: ScoringPlan
-    methods: Mapping[tuple[str, str], Sequence[Run]]
+    methods: dict[tuple[str, str], list[Run]]
 
     def truth(self, pair: Pair) -> NDArray[np.float32]:
         """What counts of a pair, float32[h, w] px, NaN elsewhere."""
-        exact = exact_truth(pair, self.products)
-        labels = exact["exact_visible"] if self.is_exact else self.dataset.labels(pair)
+        labels = self.dataset.labels(pair)
+        if self.plan.protocol in EXACT:
+            labels = exact_truth(pair, self.products)["exact_visible"]
         counted = Scorer(self.dataset.disparity_range).counted(labels)
         return np.where(counted, labels, np.float32(np.nan))
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether methods are held to the exact truth."""
-        return self.plan.protocol == "exact-2026"
 
 
 def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -> list[str]:
@@ -136,8 +134,8 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
         except InputError as error:
             refused.append(_said(error, place))
     for run in taken:
-        of = tables[run.entry.facts["dataset"]].methods
-        of.setdefault(run.entry.method, []).append(run)
+        table = tables[run.entry.facts["dataset"]]
+        table.methods.setdefault(run.entry.method, []).append(run)
     with atomic_folder(to or folder / "site") as site:
         _write(site, settings, list(tables.values()), refused)
     return [f"{file}: {problem}" for file, problem in refused]
@@ -167,12 +165,16 @@ def _table(folder: Path, name: str, settings: BoardSettings) -> Table:
             remedy="take the dataset that was sealed",
         )
     pairs = dataset.pairs(settings.split, labelled=True)
-    for pair in pairs:
-        pair.refuse_changed()
     tops = ("tiles", "results/project", "results/truth")
     known = [folder / of.project / top for top in tops] if of.project is not None else ()
+    products = Products(*known)
+    for pair in pairs:
+        pair.refuse_changed()
+        if of.protocol in EXACT and not exact_truth(pair, products):
+            problem = f"protocol {of.protocol} scores by exact truth, which this pair has not"
+            raise InputError(problem, file=pair.left, remedy="name its project, or no protocol")
     plan = ScoringPlan(settings.thresholds_px, 0, 0, 0, of.protocol)
-    return Table(dataset, Products(*known), pairs, plan, {})
+    return Table(dataset, products, pairs, plan, {})
 
 
 def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
@@ -185,16 +187,12 @@ def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
     work = folder / WORK / dataset.name / entry.name
     maps, scores = work / "maps", work / "scores"
     place = entry.submission.folder
-    program = (
-        [place / name for name in entry.submission.files] if entry.facts.get("program") else []
-    )
+    program = [place / name for name in entry.submission.files] if entry.program else []
     predict(dataset, split, entry.name, entry.settings, maps, work=work / "pairs", files=program)
     label = entry.facts["label"]
     summary = score(dataset, split, label, maps, scores, table.plan, products=table.products)
-    if program:
-        stated = entry.submission.scores.get("protocol", {}).get("id")
-        if stated not in (None, summary["protocol"]["id"]):
-            entry.refuse("scores by another protocol", "state those by this one, or none")
+    if program and entry.submission.scores:
+        hold_against(entry.submission.scores, summary)
     shown = ((p.name, read_prediction(maps, p), table.truth(p)) for p in table.pairs)
     entry.refuse_doubts(summary["doubts"], dataset, shown)
     return Run(entry, summary, maps, scores)

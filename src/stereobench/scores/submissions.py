@@ -86,16 +86,19 @@ class Entry:
         return self.facts["label"], self.facts["by"]
 
     @property
+    def program(self) -> Mapping[str, Any]:
+        """Command and lock file; empty of disparities."""
+        return self.facts.get("program") or {}
+
+    @property
     def settings(self) -> dict[str, Any]:
         """The entry of the method that makes or takes its disparities."""
-        folder = self.submission.folder
-        program = dict(self.facts.get("program") or {})
-        if not program:
-            return {"kind": FOLDER, "folder": str(folder)}
-        program.pop("lock", None)
-        command = str(program.pop("command", ""))
-        command = command.replace("{folder}", shlex.quote(str(folder)))
-        return {"kind": "command", **program, "command": command}
+        folder = str(self.submission.folder)
+        if not self.program:
+            return {"kind": FOLDER, "folder": folder}
+        kept = {key: value for key, value in self.program.items() if key != "lock"}
+        command = str(kept.get("command", "")).replace("{folder}", shlex.quote(folder))
+        return {"kind": "command", **kept, "command": command}
 
     def check_facts(self) -> None:
         """Raise InputError unless it states all that a board shows."""
@@ -105,10 +108,9 @@ class Entry:
                 self.refuse(f"{key} is not stated", f"write {key} into it, before it is admitted")
         if not isinstance(self.facts.get("seed"), int | None):
             self.refuse("seed is no whole number", "write the seed of the training, or null")
-        program = self.facts.get("program")
-        if program is not None and not (
-            isinstance(program, dict) and program.get("lock") in self.submission.files
-        ):
+        if not isinstance(self.program, dict):
+            self.refuse("program is none", "give it command and lock")
+        if self.program and self.program.get("lock") not in self.submission.files:
             self.refuse("the program has no lock file", "name it as program.lock, and in files")
 
     def refuse(self, problem: str, remedy: str, file: Path | None = None) -> None:
@@ -117,7 +119,7 @@ class Entry:
 
     def check_maps(self, dataset: StereoDataset, pairs: Sequence[Pair]) -> None:
         """Raise InputError unless there is one map of disparities of each pair, and no other."""
-        if self.facts.get("program"):
+        if self.program:
             return
         folder, names = self.submission.folder, {pair.name for pair in pairs}
         for name in self.submission.files:

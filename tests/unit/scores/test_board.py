@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+import zarr
 
 from stereobench.scores.board import make_board
 from stereobench.scores.prediction_files import FILE, pack
@@ -21,6 +22,8 @@ from stereobench.scores.predictions import predict
 from stereobench.scores.score_method import ScoringPlan, score
 from stereobench.scores.submissions import ADMITTED
 from stereotruth.core.errors import InputError
+from stereotruth.core.products.files import write_table
+from stereotruth.core.products.grids import seal as seal_store
 from stereotruth.core.products.provenance import file_sha256
 from stereotruth.tiles.seals import open_seal, seal_dataset
 from stereotruth.tiles.stereo_dataset import StereoDataset, find_pairs
@@ -28,7 +31,8 @@ from stereotruth.tiles.stereo_dataset import StereoDataset, find_pairs
 from ...synthetic.images import write
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-SHAPE, PAIRS = (12, 16), range(1, 6)
+SIZE, PAIRS = 16, range(1, 6)
+SHAPE = (SIZE, SIZE)
 OFF = {"near": 0.2, "mine": 0.3, "far": 2.0}  # px, what methods are off
 
 
@@ -112,6 +116,41 @@ def test_methods_are_ranked_with_intervals_by_one_protocol(made):
     sota = task["datasets"][0]["sota"]
     assert [row["model_name"] for row in sota["rows"]] == ["Near", "Mine", "Far"]
     assert all(set(row["metrics"]) == set(sota["metrics"]) for row in sota["rows"])
+
+
+def test_a_board_by_exact_truth_needs_it_and_refuses_scores_by_labels(made, tmp_path):
+    """The exact truth of all pixels is a px above the labels: what was 0.2 px off is 0.8 off."""
+    top = copied(made, tmp_path)
+    rows, store = [], top / "project/results/truth/Kunming/K-1.zarr"
+    truth = np.full((SIZE * 6, SIZE), np.nan, np.float32)
+    for n in PAIRS:
+        row = {"tile": f"KM_{n}", "city": "Kunming", "scene": "K-1", "split": "test"}
+        row |= {"row0": SIZE * n, "col0": 0, "size": SIZE, "right_offset_px": 0, "complete": "yes"}
+        for kind, word in (("left", "left"), ("right", "right"), ("disp", "disparity")):
+            row[kind] = f"test/{kind}/KM_{word}_{n}.tiff"
+        rows.append(row)
+        labels = cv2.imread(str(top / "data" / row["disp"]), cv2.IMREAD_UNCHANGED)
+        truth[SIZE * n : SIZE * (n + 1)] = labels + 1
+    write_table(top / "data/manifest.csv", rows)
+    layers = dict.fromkeys(("changed", "changed_right", "hidden", "surface"), truth * 0)
+    group = zarr.open_group(store, mode="w")
+    group.attrs["complete"] = True
+    for name, values in (layers | {"visible": np.isfinite(truth), "disparity": truth}).items():
+        group.create_array(name, data=np.nan_to_num(values))
+    seal_store(store)
+    settings = yaml.safe_load((top / "board.yaml").read_text())
+    of = settings["datasets"]["toy"]
+    of |= {"layout": "stereotruth", "protocol": "exact-2026", "disparity_range": [-64, 128]}
+    (top / "board.yaml").write_text(yaml.safe_dump(settings))
+    with pytest.raises(InputError):
+        make_board(top)
+    of["project"] = "project"
+    (top / "board.yaml").write_text(yaml.safe_dump(settings))
+    (line,) = make_board(top)
+    assert line.startswith(f"mine/{FILE}: ")
+    (board,) = board_of(top)["boards"]
+    near, far = (row["figures"]["epe_px"]["value"] for row in board["methods"])
+    assert board["protocol"].startswith("exact-2026-") and 0.7 < near < 0.9 and 1.1 < far < 1.5
 
 
 def test_runs_of_a_method_are_one_row_and_a_program_is_run(made, tmp_path):
