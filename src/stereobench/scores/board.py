@@ -17,11 +17,10 @@ cores.
 from __future__ import annotations
 
 import base64
-import html
 import json
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,11 +37,10 @@ from stereotruth.core.errors import InputError, in_number
 from stereotruth.core.products.files import atomic_folder, link
 from stereotruth.pages.page import write_page
 from stereotruth.pages.pictures import ERRORS, Picture, Scale
-from stereotruth.pages.tables import Cell, link_cell, minus, value_cell
 from stereotruth.pages.tables import Table as Shown
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
-from .paired import CONFIDENCE, Difference, Sums, difference, read_sums
+from .paired import CONFIDENCE, Sums, difference, differences, read_sums
 from .panels import ERROR_PX, error_picture
 from .prediction_files import hold_against, read_prediction
 from .predictions import predict
@@ -51,6 +49,8 @@ from .score_method import ScoringPlan, score
 from .scores import Scorer
 from .strata import Products, exact_truth
 from .submissions import Entry, admit, read_admitted, refuse_borrowed
+from .tables import Figure, error_figures, of_figures
+from .tables import Table as Differences
 
 log = logging.getLogger("stereotruth")
 TEMPLATE = Path(__file__).with_name("board.html.jinja")
@@ -90,7 +90,7 @@ class Run:
 
     def sums(self, figure: str) -> Sums:
         """Sums by pair of a figure of all labelled pixels, holes filled."""
-        return read_sums(self.scores, {"": ("labelled", f"filled_{figure}")})[""]
+        return read_sums(self.scores, {figure: ("labelled", figure)})[figure]
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
     places.sort(key=lambda path: (order.get(path.name, len(order)), path.name))
     tables = {name: _table(folder, name, settings) for name in settings.datasets}
     taken: list[Run] = []
-    refused: list[tuple[str, str]] = []
+    refused = []
     for place in places:
         try:
             entry = Entry.read(place, admitted)
@@ -137,8 +137,8 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
         table = tables[run.entry.facts["dataset"]]
         table.methods.setdefault(run.entry.method, []).append(run)
     with atomic_folder(to or folder / "site") as site:
-        _write(site, settings, list(tables.values()), refused)
-    return [f"{file}: {problem}" for file, problem in refused]
+        _write(site, settings, [of for of in tables.values() if of.methods], refused)
+    return [f"{of['file']}: {of['problem']}" for of in refused]
 
 
 def _settings(folder: Path) -> BoardSettings:
@@ -198,93 +198,69 @@ def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
     return Run(entry, summary, maps, scores)
 
 
-def _said(error: InputError, place: Path) -> tuple[str, str]:
+def _said(error: InputError, place: Path) -> dict[str, str]:
     """File, from the folder of submissions on, and what is said of it, without other paths."""
     file = Path(error.file) if error.file else place / "submission.json"
     inside = file if file.is_relative_to(place) else place / "submission.json"
     problem = error.problem.splitlines()[0].replace(f"{place.parent}/", "")
-    return inside.relative_to(place.parent).as_posix(), problem
+    return {"file": inside.relative_to(place.parent).as_posix(), "problem": problem}
 
 
 # ------------------------------------------------------------------------------- the figures
 
 
-def _name(row: Mapping[str, Any]) -> str:
-    """A method by its label and who submitted it."""
-    return f"{row['method']} by {row['by']}"
-
-
-def _titles(rows: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, str, float]]:
-    """Title, format and factor of the figures of the rows: EPE, and D1 at each threshold."""
-    names = rows[0]["figures"] if rows else ("epe_px",)
-    d1 = {name: (f"D1, {name[3:-9]} px (%)", ".2f", 100.0) for name in names if name != "epe_px"}
-    return {"epe_px": ("EPE (px)", ".3f", 1.0), **d1}
-
-
-def _rows(table: Table) -> list[dict[str, Any]]:
-    """The methods of a table with all figures, the least EPE first."""
-    if not table.methods:
-        return []
-    limits = next(iter(table.methods.values()))[0].summary["thresholds_px"]
-    names = ["epe_px", *(f"d1_{limit:g}_px_share" for limit in limits)]
-    sums = {
-        m: {n: [run.sums(n) for run in runs] for n in names} for m, runs in table.methods.items()
-    }
-    means = {method: {n: difference([], of[n]) for n in names} for method, of in sums.items()}
-    order = sorted(sums, key=lambda method: (means[method]["epe_px"].value or 0.0, method))
-    rows = []
-    for method in order:
-        runs = table.methods[method]
-        less = {other: difference(sums[other]["epe_px"], sums[method]["epe_px"]) for other in order}
-        better = [o for o, of in less.items() if not of.level and (of.value or 0) > 0]
+def _ranked(table: Table) -> tuple[list[dict[str, Any]], Differences]:
+    """The methods of a table, the least EPE first, and the differences of each two."""
+    summaries = [run.summary for runs in table.methods.values() for run in runs]
+    figures, rows = error_figures(summaries), []
+    labels = [label for label, _ in table.methods]
+    for (label, by), runs in table.methods.items():
         facts = runs[0].entry.facts
-        rows.append(
-            {
-                "method": method[0],
-                "by": method[1],
-                "rank": 1 + len(better),
-                "level_with": [
-                    other[0] for other in order if other != method and less[other].level
-                ],
-                "seeds": [run.entry.facts.get("seed") for run in runs],
-                "submissions": [run.entry.name for run in runs],
-                **{key: facts[key] for key in ("licence", "trained_on")},
-                "version": (facts.get("identity") or {}).get("version"),
-                "links": {k: facts[k] for k in ("paper", "code") if isinstance(facts.get(k), str)},
-                "valid_share": [run.summary["all"]["valid_share"] for run in runs],
-                "figures": {name: vars(of) for name, of in means[method].items()},
-                "less": {" by ".join(o): vars(of) for o, of in less.items() if o != method},
-                "runs": {run.entry.name: run.summary["cities"] for run in runs},
-            }
-        )
-    return rows
+        row = {
+            "method": label if labels.count(label) == 1 else f"{label}, {by}",
+            "by": by,
+            "submissions": [run.entry.name for run in runs],
+            "seeds": [run.entry.facts.get("seed") for run in runs],
+            **{key: facts[key] for key in ("licence", "trained_on")},
+            **{key: str(facts.get(key) or "") for key in ("paper", "code")},
+            "valid_share": min(run.summary["all"]["valid_share"] for run in runs),
+            "cities": {run.entry.name: run.summary["cities"] for run in runs},
+            "runs": runs,
+        }
+        for figure in figures:
+            row |= difference([], [run.sums(figure.key) for run in runs]).row(figure.key)
+        rows.append(row)
+    rows.sort(key=lambda row: (row[figures[0].key], row["method"]))
+    compared = [summaries[0] | {"label": row["method"]} for row in rows]
+    of_two = differences(compared, [[run.scores for run in row.pop("runs")] for row in rows])
+    level = [{pair["method"], pair["less"]} for pair in of_two.rows if pair["level"]]
+    for k, row in enumerate(rows):
+        others = (of["method"] for of in rows if of is not row)
+        row["level_with"] = [name for name in others if {name, row["method"]} in level]
+        row["rank"] = 1 + sum(before["method"] not in row["level_with"] for before in rows[:k])
+    return rows, of_two
 
 
 def _papers_with_code(title: str, boards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The tables in the layout of sota-extractor's evaluation tables."""
     datasets = []
     for of in boards:
-        rows = []
-        for row in of["methods"]:
-            code = row["links"].get("code")
-            paper = {"paper_title": "", "paper_url": row["links"].get("paper", "")}
-            rows.append(
-                {
-                    "model_name": row["method"],
-                    **paper,
-                    "paper_date": None,
-                    "code_links": [{"title": row["method"], "url": code}] if code else [],
-                    "model_links": [],
-                    "metrics": {
-                        title: f"{factor * row['figures'][name]['value']:{form}}"
-                        for name, (title, form, factor) in _titles(of["methods"]).items()
-                    },
-                }
-            )
-        metrics = [title for title, *_ in _titles(of["methods"]).values()]
-        about = f"Protocol {of['protocol']}, {in_number(of['pairs'], 'pair')}."
+        figures = error_figures([of["definition"]])
+        rows = [
+            {
+                "model_name": row["method"],
+                "paper_title": "",
+                "paper_url": row["paper"],
+                "paper_date": None,
+                "code_links": [{"title": row["method"], "url": row["code"]}] if row["code"] else [],
+                "model_links": [],
+                "metrics": {of.title: of.text(row, interval=False) for of in figures},
+            }
+            for row in of["methods"]
+        ]
+        about = f"Protocol {of['definition']['id']}, {in_number(of['pairs'], 'pair')}."
         more = {"subdatasets": [], "dataset_links": [], "dataset_citations": []}
-        sota = {"metrics": metrics, "rows": rows}
+        sota = {"metrics": [of.title for of in figures], "rows": rows}
         datasets.append({"dataset": of["dataset"], "description": about, **more, "sota": sota})
     task = {"task": TASK, "description": title, "subtasks": [], "source_link": None}
     return [{**task, "datasets": datasets}]
@@ -296,38 +272,29 @@ def _papers_with_code(title: str, boards: Sequence[Mapping[str, Any]]) -> list[d
 def _write(
     site: Path,
     settings: BoardSettings,
-    tables: Sequence[Table],
-    refused: Sequence[tuple[str, str]],
+    tables: Iterable[Table],
+    refused: Sequence[Mapping[str, str]],
 ) -> None:
     boards, shown = [], []
     for table in tables:
-        rows = _rows(table)
-        summaries = [run.summary for runs in table.methods.values() for run in runs]
-        protocol = summaries[0]["protocol"] if summaries else {}
-        boards.append(
-            {
-                "dataset": table.dataset.name,
-                "protocol": protocol.get("id", ""),
-                "definition": protocol,
-                "seal": table.dataset.seal,
-                "pairs": len(table.pairs),
-                "methods": rows,
-            }
-        )
-        maps = [(row["method"], _error_maps(site, table, row)) for row in rows]
+        rows, of_two = _ranked(table)
+        protocol = next(iter(table.methods.values()))[0].summary["protocol"]
+        board = {"dataset": table.dataset.name, "definition": protocol, "pairs": len(table.pairs)}
+        board |= {"seal": table.dataset.seal, "methods": rows, "differences": of_two.rows}
+        boards.append(board)
         for row in rows:
             badge = _badge(row, len(rows), protocol["id"])
             _text(site / "badges" / f"{row['submissions'][0]}.svg", badge)
-        shown.append((boards[-1], _ranking(rows), _pairs(rows), maps))
-    told = [{"file": file, "problem": problem} for file, problem in refused]
-    board = {"software": f"stereotruth {__version__}", "confidence": CONFIDENCE, "boards": boards}
-    _text(site / "board.json", _json(board | {"refused": told}))
+        maps = [_error_maps(site, table, run) for runs in table.methods.values() for run in runs]
+        shown.append((board, _ranking(rows, protocol), of_two.shown[0], sorted(maps)))
+    every = {"software": f"stereotruth {__version__}", "confidence": CONFIDENCE, "boards": boards}
+    _text(site / "board.json", _json({**every, "refused": refused}))
     _text(site / "papers_with_code.json", _json(_papers_with_code(settings.title, boards)))
     values = {
         "title": settings.title,
         "boards": shown,
         "places": [(of["dataset"], of["dataset"]) for of in boards],
-        "refused": [f"{file}: {problem}" for file, problem in refused],
+        "refused": [f"{of['file']}: {of['problem']}" for of in refused],
         "links": [(name, name, "") for name in ("board.json", "papers_with_code.json")],
         "confidence": f"{CONFIDENCE:.0%}",
         "errors": Scale.of(ERRORS, "0", f"{ERROR_PX:g} px; blue: no disparity"),
@@ -344,99 +311,53 @@ def _text(file: Path, text: str) -> None:
     file.write_text(text, encoding="utf-8", newline="\n")
 
 
-def _error_maps(
-    site: Path, table: Table, row: Mapping[str, Any]
-) -> list[tuple[str, str, list[tuple[str, str, str]]]]:
-    """Maps of errors and scores by pair of a method's runs: run, its table, maps as PNG to show."""
-    shown = []
-    for run in table.methods[row["method"], row["by"]]:
-        name, maps = run.entry.name, []
-        link(run.scores / "scores.csv", site / "scores" / f"{name}.csv")
-        for pair in table.pairs:
-            truth = table.truth(pair)
-            steps = np.floor(STEPS * np.abs(read_prediction(run.maps, pair) - truth)) / STEPS
-            picture = error_picture(steps, np.where(np.isfinite(truth), np.float32(0), truth))
-            file = site / "errors" / name / f"{pair.name}.png"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(_png(picture))
-            each = max(1, max(picture.shape[:2]) // THUMBNAIL_PX)
-            small = _png(np.ascontiguousarray(picture[each // 2 :: each, each // 2 :: each]))
-            uri = "data:image/png;base64," + base64.b64encode(small).decode("ascii")
-            maps.append((pair.name, f"errors/{name}/{pair.name}.png", uri))
-        shown.append((name, f"scores/{name}.csv", maps))
-    return shown
+def _error_maps(site: Path, table: Table, run: Run) -> tuple[str, str, list[tuple[str, str]]]:
+    """Write the maps of errors and scores by pair of a run; its name, label, maps to show."""
+    name, shown = run.entry.name, []
+    link(run.scores / "scores.csv", site / "scores" / f"{name}.csv")
+    (site / "errors" / name).mkdir(parents=True)
+    for pair in table.pairs:
+        truth = table.truth(pair)
+        steps = np.floor(STEPS * np.abs(read_prediction(run.maps, pair) - truth)) / STEPS
+        picture = error_picture(steps, np.where(np.isfinite(truth), np.float32(0), truth))
+        (site / "errors" / name / f"{pair.name}.png").write_bytes(_png(picture))
+        each = max(1, max(picture.shape[:2]) // THUMBNAIL_PX)
+        small = base64.b64encode(_png(picture[each // 2 :: each, each // 2 :: each]))
+        shown.append((pair.name, f"data:image/png;base64,{small.decode('ascii')}"))
+    return name, run.entry.facts["label"], shown
 
 
 def _png(picture: Picture) -> bytes:
-    return cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
+    return cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))[1].tobytes()
 
 
-def _interval(of: Mapping[str, Any], form: str, factor: float = 1.0) -> Cell:
-    """A figure with its interval."""
-    value, low, high = (of[key] for key in ("value", "low", "high"))
-    if value is None:
-        return value_cell(value, form)
-    text = format(factor * value, form)
-    if low is not None:
-        text += f" [{factor * low:{form}}, {factor * high:{form}}]"
-    return Cell(minus(text), f"{value:.9g}")
-
-
-def _ranking(rows: Sequence[Mapping[str, Any]]) -> Shown | None:
+def _ranking(rows: Sequence[Mapping[str, Any]], protocol: Mapping[str, Any]) -> Shown | None:
     """The methods, the least EPE first."""
-    lines = []
-    for row in rows:
-        behind = row["less"].get(_name(rows[0]))
-        seeds = [str(seed) for seed in row["seeds"] if seed is not None]
-        epe, *d1 = (_interval(row["figures"][n], *how[1:]) for n, how in _titles(rows).items())
-        lines.append(
-            (
-                value_cell(row["rank"], ".0f"),
-                link_cell(row["method"], f"#{row['submissions'][0]}", best=row["rank"] == 1),
-                epe,
-                _interval(behind, "+.3f") if behind else Cell("–", "0"),
-                Cell("\n".join(row["level_with"]) or "–", str(len(row["level_with"]))),
-                *d1,
-                value_cell(min(row["valid_share"]), ".2f", 100),
-                Cell(", ".join(seeds) or "–", str(len(seeds))),
-                *(Cell(row[key], row[key]) for key in ("trained_on", "licence", "by")),
-            )
-        )
-    epe, *d1 = (title for title, *_ in _titles(rows).values())
-    first = ("rank", "method", epe, "behind the first, px", "level with")
-    titles = (*first, *d1, "valid, %", "seeds", "trained on", "licence", "by")
-    n = len(titles)
-    return Shown.of(titles, lines, (1, 4, *range(n - 4, n)))
-
-
-def _pairs(rows: Sequence[Mapping[str, Any]]) -> Shown | None:
-    """Each two methods, the difference of their EPE."""
-    lines = []
-    for k, row in enumerate(rows):
-        for other in rows[:k]:
-            of = Difference(**row["less"][_name(other)])
-            text = f"{row['method']} less {other['method']}"
-            share = value_cell(of.better_share, ".0f", 100)
-            said = "level" if of.level else "told apart"
-            lines.append((Cell(text, text), _interval(vars(of), "+.3f"), share, Cell(said, said)))
-    return Shown.of(("methods", "EPE (px)", "better on (% of pairs)", ""), lines, (0, 3))
+    figures = [replace(figure, interval=True) for figure in error_figures([protocol])]
+    figures.append(Figure("valid, %", "valid_share", 100, ".2f"))
+    texts = [
+        {
+            **row,
+            "rank": str(row["rank"]),
+            "level_with": "\n".join(row["level_with"]) or "–",
+            "seeds": ", ".join(str(seed) for seed in row["seeds"] if seed is not None) or "–",
+        }
+        for row in rows
+    ]
+    more = ("level_with", "seeds", "trained_on", "licence", "by")
+    titles = {key: key.replace("_", " ") for key in more}
+    return of_figures(texts, {"rank": "rank", "method": "method"}, figures, titles)
 
 
 def _badge(row: Mapping[str, Any], count: int, protocol: str) -> str:
-    """A badge in the form of shields.io's: EPE, rank, protocol."""
-    epe = row["figures"]["epe_px"]["value"]
-    right = f"EPE {epe:.3f} px · rank {row['rank']} of {count}"
-    widths = [int(6.6 * len(text)) + 14 for text in (protocol, right)]
-    total, colour = sum(widths), "#2e7d32" if row["rank"] == 1 else "#37618e"
-    texts = "".join(
-        f'<text x="{x}" y="14">{html.escape(text)}</text>'
-        for x, text in ((7, protocol), (widths[0] + 7, right))
-    )
+    """A badge in the form of shields.io's: protocol; EPE and rank."""
+    epe = f"EPE {row['filled_epe_px']:.3f} px · rank {row['rank']} of {count}"
+    first, second = (int(6.6 * len(text)) + 14 for text in (protocol, epe))
+    colour = "#2e7d32" if row["rank"] == 1 else "#37618e"
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{total}" height="20" role="img" '
-        f'aria-label="{html.escape(protocol)}: {html.escape(right)}">'
-        f'<rect width="{total}" height="20" rx="3" fill="#444"/>'
-        f'<path d="M{widths[0]} 0h{widths[1] - 3}q3 0 3 3v14q0 3-3 3h-{widths[1] - 3}z" '
-        f'fill="{colour}"/><g fill="#fff" font-family="Verdana,DejaVu Sans,sans-serif" '
-        f'font-size="11">{texts}</g></svg>\n'
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{first + second}" height="20" role="img" '
+        f'aria-label="{protocol}: {epe}"><rect width="{first}" height="20" fill="#444"/>'
+        f'<rect x="{first}" width="{second}" height="20" fill="{colour}"/>'
+        '<g fill="#fff" font-family="Verdana,DejaVu Sans,sans-serif" font-size="11">'
+        f'<text x="7" y="14">{protocol}</text><text x="{first + 7}" y="14">{epe}</text></g></svg>\n'
     )

@@ -135,7 +135,7 @@ def _tables(
         by_city(methods, trained, beside_paper=beside_paper),
         of_fine_tuned(methods, trained, beside_paper=beside_paper),
         by_strata(methods),
-        differences(methods, scores),
+        differences(methods, [[folder] for folder in scores]),
         confidence_table(methods),
         beside_published(methods),
     ]

@@ -181,21 +181,25 @@ def compare_folders(first: Sequence[Path], second: Sequence[Path]) -> list[str]:
     return lines
 
 
-def differences(methods: Sequence[Row], folders: Sequence[str | Path]) -> Table:
-    """How much methods differ two by two on the same tiles; ``folders``: with ``scores.csv``."""
+def differences(methods: Sequence[Row], folders: Sequence[Sequence[str | Path]]) -> Table:
+    """How much methods differ two by two on the same tiles.
+
+    ``folders``: of the runs of each method, with ``scores.csv``.
+    """
     title = "Differences: method by method on the same tiles"
     if len(methods) < 2:
         return Table("differences", title, [], [("One method alone.", None)])
     limit = methods[0]["thresholds_px"][0]
     names = {"epe_px": "filled_epe_px", "d1_share": f"filled_d1_{limit:g}_px_share"}
     columns = {key: ("labelled", name) for key, name in names.items()}
-    sums = [read_sums(folder, columns) for folder in folders]
+    sums = [[read_sums(folder, columns) for folder in runs] for runs in folders]
     rows = []
     for a, b in combinations(range(len(methods)), 2):
         row: dict[str, Any] = {"method": methods[b]["label"], "less": methods[a]["label"]}
         for key in names:
-            found = difference([sums[a][key]], [sums[b][key]])
+            found = difference(*([run[key] for run in sums[k]] for k in (a, b)))
             row |= {"tiles": found.tiles, **found.row(key)}
+            row.setdefault("level", found.level)  # in EPE
         rows.append(row)
     better = "better on (% of tiles)"
     figures = [
@@ -209,5 +213,6 @@ def differences(methods: Sequence[Row], folders: Sequence[str | Path]) -> Table:
         f"Difference of {FILLED}, with {CONFIDENCE:.0%} confidence from the differences by tile: "
         "negative where the first of the two is better, level where the interval holds 0."
     )
-    shown = of_figures(named, {"name": "Methods"}, figures)
+    told = [{**row, "said": "level" if row["level"] else "told apart"} for row in named]
+    shown = of_figures(told, {"name": "Methods"}, figures, {"said": "in EPE"})
     return Table("differences", title, rows, [(caption, shown)])

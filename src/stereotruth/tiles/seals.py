@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ..core.errors import InputError, in_number
 from ..core.products.files import (
@@ -71,21 +71,10 @@ class Seal:
         return read_record(file, make, what="seal", stage="sealing")
 
 
-class Labelled(Protocol):
-    """What is asked of a pair (:class:`.stereo_dataset.Pair`)."""
-
-    name: str
-    split: str
-    left: Path
-    right: Path
-    disparity: Path | None
-    row: Mapping[str, str]
-
-
-def seal_dataset(root: str | Path, pairs: Iterable[Labelled], split: str, to: str | Path) -> str:
+def seal_dataset(root: str | Path, pairs: Iterable[Any], split: str, to: str | Path) -> str:
     """Write a copy of a dataset without the labels of a split; what to say of it.
 
-    ``pairs``: all of the dataset.
+    ``pairs``: all of the dataset (:class:`.stereo_dataset.Pair`).
     """
     root, to = Path(root), Path(to)
     if Seal.of(root) is not None:

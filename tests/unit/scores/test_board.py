@@ -99,16 +99,20 @@ def board_of(folder: Path) -> dict:
 
 def test_methods_are_ranked_with_intervals_by_one_protocol(made):
     (of,) = board_of(made)["boards"]
-    assert of["protocol"].startswith("own-") and of["pairs"] == 5
+    assert of["definition"]["id"].startswith("own-") and of["pairs"] == 5
     assert [(row["method"], row["rank"]) for row in of["methods"]] == [
         ("Near", 1), ("Mine", 2), ("Far", 3),
     ]  # fmt: skip
-    epe = of["methods"][0]["figures"]["epe_px"]
-    assert epe["low"] < epe["value"] < epe["high"] and 0.2 < epe["value"] < 0.5
+    first = of["methods"][0]
+    assert first["filled_epe_px_low"] < first["filled_epe_px"] < first["filled_epe_px_high"]
+    assert 0.2 < first["filled_epe_px"] < 0.5 and first["level_with"] == []
+    assert [(row["method"], row["less"]) for row in of["differences"]] == [
+        ("Mine", "Near"), ("Far", "Near"), ("Far", "Mine"),
+    ]  # fmt: skip
     assert of["methods"][1]["seeds"] == [1] and of["methods"][1]["trained_on"] == "us3d"
     for name in OFF:
         badge = ElementTree.parse(made / f"site/badges/{name}.svg").getroot()
-        assert of["protocol"] in badge.get("aria-label")
+        assert of["definition"]["id"] in badge.get("aria-label")
         for n in PAIRS:
             picture = cv2.imread(str(made / f"site/errors/{name}/KM_{n}.png"), cv2.IMREAD_UNCHANGED)
             assert picture.dtype == np.uint8 and picture.shape[:2] == SHAPE
@@ -149,8 +153,8 @@ def test_a_board_by_exact_truth_needs_it_and_refuses_scores_by_labels(made, tmp_
     (line,) = make_board(top)
     assert line.startswith(f"mine/{FILE}: ")
     (board,) = board_of(top)["boards"]
-    near, far = (row["figures"]["epe_px"]["value"] for row in board["methods"])
-    assert board["protocol"].startswith("exact-2026-")
+    near, far = (row["filled_epe_px"] for row in board["methods"])
+    assert board["definition"]["id"].startswith("exact-2026-")
     assert 0.8 < near < 1.0 < far < 1.6
 
 
