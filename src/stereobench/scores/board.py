@@ -188,7 +188,8 @@ def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
     maps, scores = work / "maps", work / "scores"
     place = entry.submission.folder
     program = [place / name for name in entry.submission.files] if entry.program else []
-    predict(dataset, split, entry.name, entry.settings, maps, work=work / "pairs", files=program)
+    settings = entry.settings(work / "program")
+    predict(dataset, split, entry.name, settings, maps, work=work / "pairs", files=program)
     label = entry.facts["label"]
     summary = score(dataset, split, label, maps, scores, table.plan, products=table.products)
     if program and entry.submission.scores:

@@ -3,7 +3,7 @@
 A folder of ``submissions/`` has ``submission.json`` (:mod:`.prediction_files`) with label, ``by``,
 licence, training data, seed, dataset and the checksum of each file; and either a disparity map for
 each pair, or a program with its lock file (``program``: a method's entry of kind ``command``, in
-which ``{folder}`` stands for the folder, and ``lock``, the file's name). ``admitted.csv`` beside
+which ``{folder}`` stands for a copy of the folder, and ``lock``, the file's name). ``admitted.csv`` beside
 them has the checksum of each ``submission.json`` when its maintainer took it in, so that no later
 edit passes, whatever it states of itself. Each refusal names a file.
 """
@@ -11,6 +11,7 @@ edit passes, whatever it states of itself. Each refusal names a file.
 from __future__ import annotations
 
 import shlex
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,14 +91,15 @@ class Entry:
         """Command and lock file; empty of disparities."""
         return self.facts.get("program") or {}
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The entry of the method that makes or takes its disparities."""
-        folder = str(self.submission.folder)
+    def settings(self, work: Path) -> dict[str, Any]:
+        """The entry of the method that takes its disparities, or runs a copy of its program."""
+        folder = self.submission.folder
         if not self.program:
-            return {"kind": FOLDER, "folder": folder}
+            return {"kind": FOLDER, "folder": str(folder)}
+        shutil.rmtree(work, ignore_errors=True)  # so that nothing it leaves there counts
+        shutil.copytree(folder, work)
         kept = {key: value for key, value in self.program.items() if key != "lock"}
-        command = str(kept.get("command", "")).replace("{folder}", shlex.quote(folder))
+        command = str(kept.get("command", "")).replace("{folder}", shlex.quote(str(work)))
         return {"kind": "command", **kept, "command": command}
 
     def check_facts(self) -> None:

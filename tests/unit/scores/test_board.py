@@ -170,7 +170,7 @@ def test_runs_of_a_method_are_one_row_and_a_program_is_run(made, tmp_path):
     program = top / "submissions/program"
     program.mkdir()
     (program / "grey.py").write_text(
-        "import csv, sys, cv2\n"
+        "import csv, sys, cv2\nopen(__file__ + '.left', 'w')\n"
         "for left, _, out in csv.reader(open(sys.argv[1])):\n"
         "    cv2.imwrite(out, (cv2.imread(left, -1) % 7).astype('float32'))\n"
     )
