@@ -3,9 +3,9 @@
 A folder of ``submissions/`` has ``submission.json`` (:mod:`.prediction_files`) with label, ``by``,
 licence, training data, seed, dataset and the checksum of each file; and either a disparity map for
 each pair, or a program with its lock file (``program``: a method's entry of kind ``command``, in
-which ``{folder}`` stands for a copy of the folder, and ``lock``, the file's name). ``admitted.csv`` beside
-them has the checksum of each ``submission.json`` when its maintainer took it in, so that no later
-edit passes, whatever it states of itself. Each refusal names a file.
+which ``{folder}`` stands for a copy of the folder, and ``lock``, the file's name). ``admitted.csv``
+beside them has the checksum of each ``submission.json`` when its maintainer took it in, so that no
+later edit passes, whatever it states of itself. Each refusal names a file.
 """
 
 from __future__ import annotations
