@@ -78,6 +78,9 @@ rule originals:
     params:
         sources=upstream("originals"),
         images=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
+        cells=lambda w: {
+            s.scene: [cells_of(name) for name in IMAGE_NAMES[s.scene]] for s in scenes_of(w.city)
+        },
         code=source_digest("stereotruth.tiles.originals"),
     message:
         "Cropping the original images of {wildcards.city}"
