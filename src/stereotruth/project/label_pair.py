@@ -19,7 +19,6 @@ from ..core.errors import InputError
 from ..core.products.grids import open_grid
 from ..core.products.remote_files import is_remote
 from ..core.sheets import FILES, LIDAR_SEPARATOR
-from ..epipolar.intersection import with_ground
 from ..epipolar.warping import warp_rows
 from .new_project import begin, city_row
 from .project import CONFIG
@@ -114,10 +113,3 @@ class PairAccessor:
         values = warp_rows(right, columns - float(data["x_right"][0]))
         attrs = data["left"].attrs | {"long_name": "right image, warped to the left one"}
         return xr.DataArray(values, data["disparity"].coords, ("y", "x"), "warped", attrs)
-
-    def ground(self) -> xr.Dataset:
-        """The dataset with ``lon`` and ``lat`` [y, x] of its heights (degrees, WGS 84).
-
-        See :func:`stereotruth.epipolar.intersection.with_ground`.
-        """
-        return with_ground(self._dataset)

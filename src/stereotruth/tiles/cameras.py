@@ -186,8 +186,8 @@ class Pinhole:
     ``focal`` (x, y) px; ``centre``: principal point (col, row) of the image without skew, from the
     centre of its upper-left pixel; ``rotation`` [3, 3], ``translation`` [3] m: from the local frame
     to the camera (right, down, ahead). ``skew``: columns that a row moves for each row below the
-    middle; ``mirrored``: whether the crop shows the ground mirrored, and its columns are turned.
-    ``max_error_px``: the largest difference from the RPC, in the crop.
+    middle. ``max_error_px``: the largest difference from the RPC, in the crop (of a crop that shows
+    the ground mirrored, which no camera does, thousands).
     """
 
     crop: Crop
@@ -196,7 +196,6 @@ class Pinhole:
     rotation: Floats
     translation: Floats
     skew: float
-    mirrored: bool
     max_error_px: float = np.nan
 
     @cached_property
@@ -212,13 +211,11 @@ class Pinhole:
     def columns(self) -> Floats:
         """[rows, cols]: the column of the crop, in the same row, that each pixel shows."""
         row, col = np.indices(self.size[::-1], dtype=np.float64)
-        col += self.skew * (row - (self.size[1] - 1) / 2) - self.margin
-        return self.crop.size[0] - 1 - col if self.mirrored else col
+        return col + self.skew * (row - (self.size[1] - 1) / 2) - self.margin
 
     def without_skew(self, pixels: Floats) -> Floats:
         """Places [n, 2] (col, row) of the crop in the image without skew."""
         col, row = pixels.T
-        col = self.crop.size[0] - 1 - col if self.mirrored else col
         return np.stack([col - self.skew * (row - (self.size[1] - 1) / 2) + self.margin, row], 1)
 
     def project(self, xyz: Floats) -> Floats:
@@ -234,10 +231,6 @@ class Pinhole:
         middle, there = xyz.mean(axis=0), pixels.mean(axis=0)
         terms, shown = np.c_[xyz - middle, np.ones(len(xyz))], pixels - there
         slopes = np.linalg.lstsq(terms, shown, rcond=None)[0][:3].T
-        mirrored = bool(np.cross(*slopes)[2] > 0)  # a camera that looks down has x to its right
-        if mirrored:
-            shown[:, 0] *= -1
-            slopes[0] *= -1
         ahead = np.cross(*slopes)
         axis = _axis(terms, shown, ahead / np.linalg.norm(ahead))
         weighted = shown * (terms[:, :3] @ axis + 1)[:, None]
@@ -248,23 +241,12 @@ class Pinhole:
         down = rows[1, :3] - (rows[1, :3] @ z) * z
         y = down / np.linalg.norm(down)
         rotation = np.stack([np.cross(y, z), y, z])
-        k = rows[:, :3] @ rotation.T * distance
-        moved = rows[:, 3] * distance - k[:, 2] * distance
-        t_y = moved[1] / k[1, 1]
-        t = np.array([(moved[0] - k[0, 1] * t_y) / k[0, 0], t_y, distance])
-        skew = k[0, 1] / k[1, 1]
-        found = cls(
-            crop=crop,
-            focal=(float(k[0, 0]), float(k[1, 1])),
-            centre=(0.0, 0.0),
-            rotation=rotation,
-            translation=t - rotation @ middle,
-            skew=float(skew),
-            mirrored=mirrored,
-        )
-        # ``there`` stays in the image without skew, but for its margin.
-        middle_px = found.without_skew(there[None])[0]
-        found = replace(found, centre=tuple((middle_px + k[:, 2] - (skew * k[1, 2], 0.0)).tolist()))
+        inner = np.vstack([rows[:, :3] @ rotation.T * distance, [0.0, 0.0, 1.0]])
+        t = np.linalg.solve(inner, [*rows[:, 3] * distance, distance]) - rotation @ middle
+        skew, focal = inner[0, 1] / inner[1, 1], (float(inner[0, 0]), float(inner[1, 1]))
+        found = cls(crop, focal, (0.0, 0.0), rotation, t, float(skew))
+        apart = inner[:2, 2] - (skew * inner[1, 2], 0.0)  # of the principal point and ``there``
+        found = replace(found, centre=tuple((found.without_skew(there[None])[0] + apart).tolist()))
         pixels, ground = crop.points(CHECK)
         off = found.project(np.stack(frame.transform(*ground.T), 1)) - found.without_skew(pixels)
         off[:, 0] += skew * off[:, 1]  # as it is in the crop
@@ -298,13 +280,13 @@ class Pair:
 def write_satnerf(
     folder: Path, pairs: Sequence[Pair], taken: Sequence[Sequence[Acquisition]]
 ) -> None:
-    """Write a JSON file for each crop, ``train.txt`` of all, and the places in ``pts3d.npy``.
+    """Write a JSON file for each crop, and the places in ``pts3d.npy``.
 
     ``taken``: of both images, by pair. Places are geocentric WGS 84, m; a crop's ``keypoints`` have
     their pixels and numbers.
     """
     folder.mkdir()
-    names, count = [], 0
+    count = 0
     for pair, both in zip(pairs, taken):
         numbers = range(count, count + len(pair.ground))
         for hole, pixels, acquisition in zip(pair.pinholes, pair.pixels, both):
@@ -313,22 +295,18 @@ def write_satnerf(
                 "2d_coordinates": pixels.tolist(),
                 "pts3d_indices": list(numbers),
             }
-            names.append(hole.crop.json_name)
-            (folder / names[-1]).write_text(json.dumps(record), encoding="ascii")
+            (folder / hole.crop.json_name).write_text(json.dumps(record), encoding="ascii")
         count = numbers.stop
     ground = np.concatenate([pair.ground for pair in pairs])
     np.save(folder / "pts3d.npy", np.stack(ECEF.transform(*ground.T), 1))
-    (folder / "train.txt").write_text("\n".join(names), encoding="ascii")
 
 
 def write_eogs(folder: Path, pair: Pair, taken: Sequence[Acquisition]) -> list[float]:
-    """Write a tile's ``affine_models.json`` and ``train.txt``; both crops' errors, px."""
+    """Write a tile's ``affine_models.json``; both crops' errors, px."""
     folder.mkdir(parents=True)
     crops = [hole.crop for hole in pair.pinholes]
     models = eogs_models(crops, [satnerf_record(*both) for both in zip(crops, taken)])
     (folder / "affine_models.json").write_text(json.dumps(models), encoding="ascii")
-    names = (crop.json_name for crop in crops)
-    (folder / "train.txt").write_text("\n".join(names), encoding="ascii")
     return [model["max_error_px"] for model in models[:2]]
 
 

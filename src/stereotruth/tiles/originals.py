@@ -55,7 +55,7 @@ HEIGHTS = {
 VISIBILITY = LayerKind("uint8", 0, "0: not known, 1: visible in the other image, 2: hidden there")
 SAME_PX = 1.5  # that two rays' ends lie apart where both images show one place
 LABELS = 4  # px between the labels that tell which heights a crop shows
-POINTS = 64  # labels along a side of a tile that become points of the models
+POINTS = 32  # labels along a side of a tile that become points of the models
 HEIGHT_MARGIN_M = 5.0  # of the cameras' heights beyond those of the labels
 README = """Crops of the original images, with corrected RPCs
 
