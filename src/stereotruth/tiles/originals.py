@@ -185,13 +185,14 @@ def _labels(
 
     The heights are those of the labels and a margin, or without any those that the scene may have.
     """
-    if not row["disp"]:
-        return np.empty((0, 3)), tuple(record["ground"]["height_range_m"])
-    with open_raster(tiles / row["disp"]) as source:
-        disparity = source.read(1, masked=True).filled(np.nan).astype(np.float64)
-    every = max(1, len(disparity) // POINTS)
+    disparity = np.empty((0, 0))
+    if row["disp"]:
+        with open_raster(tiles / row["disp"]) as source:
+            disparity = source.read(1, masked=True).filled(np.nan).astype(np.float64)
     y, x = np.nonzero(np.isfinite(disparity))
-    d = disparity[y, x]
+    if not y.size:
+        return np.empty((0, 3)), tuple(record["ground"]["height_range_m"])
+    d, every = disparity[y, x], max(1, len(disparity) // POINTS)
     chosen = (y % every == every // 2) & (x % every == every // 2)
     extreme = (y % LABELS == 0) & (x % LABELS == 0) | (d == d.min()) | (d == d.max())
     heights = evaluate(record["ground"], x[extreme], y[extreme], d[extreme])["height"]
