@@ -105,7 +105,7 @@ def satnerf_record(crop: Crop, taken: Acquisition) -> dict[str, Any]:
         "geojson": {
             "type": "Polygon",
             "coordinates": [corners],
-            "center": [float(for_readers(lon).mean()), float(lat.mean())],
+            "center": [float(for_readers(lon.mean())), float(lat.mean())],
         },
         "min_alt": crop.heights[0],
         "max_alt": crop.heights[1],
