@@ -162,7 +162,10 @@ def _tile(
         name = f"colmap/images/{hole.crop.name}"
         _write_without_skew(scratch / hole.crop.name, scratch / name, hole)
         found |= _listed(scratch, f"{view}_colmap", name)
-        found[f"{view}_colmap_max_error_px"] = float(f"{hole.max_error_px:.2g}")
+        found |= {
+            f"{view}_colmap_skew": hole.skew,
+            f"{view}_colmap_max_error_px": float(f"{hole.max_error_px:.2g}"),
+        }
     pixels = [np.stack(crop.rpc.project(*ground.T), 1) for crop in crops]
     inside = np.ones(len(ground), bool)
     for crop, at in zip(crops, pixels):
