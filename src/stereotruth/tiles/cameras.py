@@ -42,6 +42,7 @@ ECEF = Transformer.from_pipeline(CART)
 BANDS = "CDEFGHJKLMNPQRSTUVWXX"  # of latitude, 8 degrees each from 80 south on
 NAMES = {"line": "row", "samp": "col", "long": "lon", "height": "alt", "off": "offset"}
 NAMES |= {"coeff": ""}
+GREY = "128 128 128"  # of all points: their colour is that of the images
 
 
 def local_frame(lon: float, lat: float) -> Transformer:
@@ -268,13 +269,12 @@ class Pair:
     """Cameras of a tile's left and right crop, and places of its labels that both show.
 
     ``ground`` [n, 3]: lon, lat, height (degrees, degrees, m); ``pixels``: (col, row) [n, 2] of the
-    places in either crop; ``colours`` uint8 [n, 3].
+    places in either crop.
     """
 
     pinholes: tuple[Pinhole, Pinhole]
     ground: Floats
     pixels: tuple[Floats, Floats]
-    colours: NDArray[np.uint8]
 
 
 def write_satnerf(
@@ -291,10 +291,8 @@ def write_satnerf(
         numbers = range(count, count + len(pair.ground))
         for hole, pixels, acquisition in zip(pair.pinholes, pair.pixels, both):
             record = satnerf_record(hole.crop, acquisition)
-            record["keypoints"] = {
-                "2d_coordinates": pixels.tolist(),
-                "pts3d_indices": list(numbers),
-            }
+            seen = {"2d_coordinates": pixels.tolist(), "pts3d_indices": list(numbers)}
+            record |= {"keypoints": seen}
             (folder / hole.crop.json_name).write_text(json.dumps(record), encoding="ascii")
         count = numbers.stop
     ground = np.concatenate([pair.ground for pair in pairs])
@@ -332,10 +330,9 @@ def write_colmap(folder: Path, pairs: Sequence[Pair], frame: Transformer) -> Non
             ]
             seen = (f"{_numbers(place + 0.5)} {n}" for n, place in enumerate(at, count + 1))
             images += [hole.pose(number), " ".join(seen)]
-        for n, (at, colour) in enumerate(zip(xyz, pair.colours)):
-            rgb = " ".join(map(str, colour))
+        for n, at in enumerate(xyz):
             track = f"{left} {n} {left + 1} {n}"
-            points.append(f"{count + n + 1} {_numbers(at)} {rgb} {error[n]:.4f} {track}")
+            points.append(f"{count + n + 1} {_numbers(at)} {GREY} {error[n]:.4f} {track}")
         count += len(xyz)
     for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
         (folder / f"{name}.txt").write_text("\n".join([*lines, ""]), encoding="ascii")

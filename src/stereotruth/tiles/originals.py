@@ -54,8 +54,7 @@ HEIGHTS = {
 }
 VISIBILITY = LayerKind("uint8", 0, "0: not known, 1: visible in the other image, 2: hidden there")
 SAME_PX = 1.5  # that two rays' ends lie apart where both images show one place
-LABELS = 4  # px between the labels that tell which heights a crop shows
-POINTS = 32  # labels along a side of a tile that become points of the models
+POINTS = 32  # labels along a side of a tile that become points of the models; and the extremes
 HEIGHT_MARGIN_M = 5.0  # of the cameras' heights beyond those of the labels
 README = """Crops of the original images, with corrected RPCs
 
@@ -170,10 +169,7 @@ def _tile(
     inside = np.ones(len(ground), bool)
     for crop, at in zip(crops, pixels):
         inside &= ((at > -0.5) & (at < np.array(crop.size) - 0.5)).all(axis=1)
-    pixels = tuple(at[inside] for at in pixels)
-    return found, Pair(
-        pinholes, ground[inside], pixels, _colours(scratch / found["left"], pixels[0])
-    )
+    return found, Pair(pinholes, ground[inside], tuple(at[inside] for at in pixels))
 
 
 def _listed(scratch: Path, column: str, name: str) -> dict[str, str]:
@@ -197,11 +193,10 @@ def _labels(
         return np.empty((0, 3)), tuple(record["ground"]["height_range_m"])
     d, every = disparity[y, x], max(1, len(disparity) // POINTS)
     chosen = (y % every == every // 2) & (x % every == every // 2)
-    extreme = (y % LABELS == 0) & (x % LABELS == 0) | (d == d.min()) | (d == d.max())
-    heights = evaluate(record["ground"], x[extreme], y[extreme], d[extreme])["height"]
+    chosen |= (d == d.min()) | (d == d.max())
     place = evaluate(record["ground"], x[chosen], y[chosen], d[chosen])
-    range_m = float(heights.min()) - HEIGHT_MARGIN_M, float(heights.max()) + HEIGHT_MARGIN_M
-    return np.stack([place[k] for k in ("lon", "lat", "height")], 1), range_m
+    low, high = place["height"].min() - HEIGHT_MARGIN_M, place["height"].max() + HEIGHT_MARGIN_M
+    return np.stack([place[k] for k in ("lon", "lat", "height")], 1), (float(low), float(high))
 
 
 def _taken(image: str | Path, cell: Cells, rpc: RPC) -> Acquisition:
@@ -369,23 +364,9 @@ def _write_without_skew(crop: Path, out: Path, hole: Pinhole) -> None:
     Of colour images red, green and blue; 0 where the crop has nothing, or nodata.
     """
     at = hole.columns()
-    bands = [warp_rows(band, at) for band in _bands(crop)]
     with open_raster(crop) as source:
-        kind = np.dtype(source.dtypes[0])
-    values = np.nan_to_num(np.stack(bands))
-    if kind.kind in "iu":
+        bands = source.read([1, 2, 3] if source.count > 2 else [1])
+    values = np.nan_to_num(np.stack([warp_rows(band.astype(np.float64), at) for band in bands]))
+    if (kind := bands.dtype).kind in "iu":
         values = np.clip(np.rint(values), np.iinfo(kind).min, np.iinfo(kind).max)
     write_tiff(out, (values if len(bands) > 1 else values[0]).astype(kind))
-
-
-def _bands(crop: Path) -> Floats:
-    """[3, h, w] of a crop in colour, [1, h, w] of another one."""
-    with open_raster(crop) as source:
-        return source.read(list(range(1, 4 if source.count > 2 else 2))).astype(np.float64)
-
-
-def _colours(crop: Path, pixels: Floats) -> NDArray[np.uint8]:
-    """Red, green and blue [n, 3] of places [n, 2] in a crop, from 0 for black to its brightest."""
-    values = np.broadcast_to(bands := _bands(crop), (3, *bands.shape[1:]))
-    col, row = np.rint(pixels).astype(np.int64).T
-    return np.clip(255 * values[:, row, col].T / max(bands.max(), 1.0), 0, 255).astype(np.uint8)
