@@ -424,19 +424,23 @@ def growth(folder: Path, stores: Sequence[Path], settings: Mapping[str, Any]) ->
     shutil.rmtree(folder / "growth", ignore_errors=True)
     quarters = [cut(folder, number) for number in range(4)]
 
+    start = fastest(lambda: job("import stereotruth.labels.project", env=env), 3)[1]
+
+    def spent(code: str, *arguments: object) -> float:
+        return round(fastest(lambda: job(code, *arguments, env=env), 1)[1] - start, 2)
+
     def surface(name: str, image: Path, strip: str = "") -> float:
         made = folder / "growth" / name / "s.surface"
-        arguments = image, points, made, folder / "growth.log", strip
-        return fastest(lambda: job(STRIP_JOB, *arguments, env=env), 1)[1]
+        return spent(STRIP_JOB, image, points, made, folder / "growth.log", strip)
 
     def project(place: Path) -> float:
         made = folder / "growth" / f"labels of {place.name}"
+        shutil.rmtree(made, ignore_errors=True)
         made.mkdir()
         (made / "s.surface").symlink_to(folder / "growth" / "whole" / "s.surface")
-        rectified = place / "left.zarr", place / "right.zarr"
+        rectified, log = (place / "left.zarr", place / "right.zarr"), folder / "growth.log"
         out, alignment = made / "disparity.zarr", place / "alignment.json"
-        of_scene = *rectified, points, out, folder / "growth.log", alignment, *told
-        return fastest(lambda: job(PROJECT_JOB, *of_scene, env=env), 1)[1]
+        return spent(PROJECT_JOB, *rectified, points, out, log, alignment, *told)
 
     def megapixels(place: Path) -> float:
         return float(np.prod(EpipolarModel.load(place / "epipolar.json").shape)) / 1e6
@@ -445,17 +449,20 @@ def growth(folder: Path, stores: Sequence[Path], settings: Mapping[str, Any]) ->
     whole = surface("whole", folder / "left.tif")
     parts = [surface(place.name, place / "left.tif") for place in quarters]
     strips = [surface("strips", folder / "left.tif", strip) for strip in ("0-of-2", "1-of-2", "")]
-    project(quarters[0])
-    shutil.rmtree(folder / "growth" / f"labels of {quarters[0].name}")
+    found = {
+        "surface, s: whole, quarters": (whole, parts),
+        "surface, s: two strips, their joining": strips,
+        "surface, a megapixel, whole / quarters": whole / sum(parts),
+        "surface, the longer of two strips / one job": max(strips[:2]) / whole,
+    }
+    print(json.dumps(found, indent=1), flush=True)
+    project(quarters[0])  # compiles
     labels, of_quarters = project(folder), [project(place) for place in quarters]
     sizes = megapixels(folder), sum(map(megapixels, quarters))
     return {
-        "Mpx, whole and quarters": sizes,
-        "surface": {"whole": whole, "quarters": parts, "strips, then the rest": strips},
-        "project": {"whole": labels, "quarters": of_quarters},
-        "surface, a megapixel, whole / quarters": whole / sum(parts),
+        "Mpx: whole, quarters": sizes,
+        "project, s: whole, quarters": (labels, of_quarters),
         "project, a megapixel, whole / quarters": labels / sizes[0] * sizes[1] / sum(of_quarters),
-        "surface, the longest of two strips / one job": max(strips[:2]) / whole,
     }
 
 
