@@ -309,9 +309,9 @@ class Configuration(Section):
     dataset: Dataset = Field(default_factory=Dataset)
 
     strips: Annotated[Strips | dict[str, Strips], Unit("number, or scene: number")] = 1
-    """jobs among which the grid of a scene is shared, each for some rows of blocks of 1024 px; for
-    any cluster that Snakemake submits jobs to, without a Dask that runs there. The bytes are those
-    of one job"""
+    """jobs among which `rectify`, `surface` and `project` of a scene are shared, each for some
+    of its blocks; for any cluster that Snakemake submits jobs to, without a Dask that runs there.
+    The bytes are those of one job"""
 
     dask: Dask = Field(default_factory=Dask)
     report: Report = Field(default_factory=Report)
