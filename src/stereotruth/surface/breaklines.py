@@ -12,8 +12,9 @@ Of the triangles in a square of two spacings the first one that is cut finds the
 others take it where it cuts them, too, and their own vertices lie where it says: four of five
 triangles along a wall would find the same.
 
-All follows from the points up to BREAKLINE_REACH around the triangles of a square, in an order of theirs that no
-window changes. No image takes part, so that labels do not favour what images show well.
+All follows from the points up to BREAKLINE_REACH around the triangles of a square, in an order of
+theirs that no window changes. No image takes part, so that labels do not favour what images show
+well.
 """
 
 from __future__ import annotations
@@ -383,10 +384,10 @@ def _fill_breaklines(
             continue
         if leads and of_square == square[t]:
             line = _mean_line(planed, abc, lead, normal, polygons, s)
-            if line[3] <= WIDEST_STRIP * spacing and _cuts(planed, abc, lead, line):
-                if _fits_corners(planed, abc, lead, found.planes, line, residual):
-                    _keep(planed, a, lead, line, found, limits, out, t)
-                    continue
+            fits = line[3] <= WIDEST_STRIP * spacing and _cuts(planed, abc, lead, line)
+            if fits and _fits_corners(planed, abc, lead, found.planes, line, residual):
+                _keep(planed, a, lead, line, found, limits, out, t)
+                continue
         ox = float(x[b] - x[a] + x[c] - x[a]) / 3.0
         oy = float(y[b] - y[a] + y[c] - y[a]) / 3.0
         centre = Centroid(x[a], y[a], ox, oy)

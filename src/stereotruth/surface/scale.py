@@ -31,7 +31,7 @@ SWEPT_RADIUS = 3.0
 SWEPT_CELLS = 32
 # Spacings of points along a breakline, to either side of a triangle, that determine it.
 BREAKLINE_REACH = 12.0
-# Side of the squares, in spacings, in which a triangle takes the breakline of another one that fits.
+# Spacings of points along the side of a square, whose triangles share breaklines.
 SHARED_SPACINGS = 2.0
 # Spacings of points around a vertex of a rough surface that decide whether it is a top.
 ROUGH_REACH = 2.2
@@ -142,10 +142,10 @@ class SurfaceScale:
         The vertices of a triangle lie within two radii of any place in its circumcircle. A label
         follows from its facet, its neighbours and theirs (noise), the neighbours of these
         (support), the triangles that share a vertex with them (planes), and again (slopes): six
-        steps of two radii. A breakline follows from the points up to BREAKLINE_REACH around and
-        their planes (two radii more), of any triangle of a square; a rough surface from six steps, and its labels from
-        ``rough_halo_cells`` around. Which vertices there are follows from the squares around
-        (:func:`.vertices.even_ground`).
+        steps of two radii. A breakline follows from the points up to BREAKLINE_REACH around any
+        triangle of a square and their planes (two radii more); a rough surface from six steps, and
+        its labels from ``rough_halo_cells`` around. Which vertices there are follows from the
+        squares around (:func:`.vertices.even_ground`).
         """
         facet, swept = self.facet_radius, self.swept_radius
         halo = max(12 * facet, 2 * swept) + BREAKLINE_REACH * self.spacing + 2 * facet
