@@ -295,7 +295,7 @@ def _cuts(
     return low < 0.0 < high
 
 
-class _Found(NamedTuple):
+class _Shared(NamedTuple):
     """Of the triangle that has found a breakline: its ``planes`` [2, 3] at its centroid, ``sums``
     [2, 5] of the points on them, ``whole`` [4]: their vertices, least and greatest height."""
 
@@ -310,7 +310,7 @@ def _keep(
     a: int,
     centre: Centroid,
     line: tuple[float, float, float, float],
-    found: _Found,
+    shared: _Shared,
     limits: _Limits,
     out: Breaklines,
     t: int,
@@ -322,14 +322,14 @@ def _keep(
     out.line[t, 0], out.line[t, 1] = p, q
     out.line[t, 2], out.line[t, 3] = r - p * dx - q * dy, width
     for side in range(2):
-        count, gx, gy = found.sums[side, 0], found.planes[side, 1], found.planes[side, 2]
-        level = found.planes[side, 0] + found.sums[side, 3] / count
+        count, gx, gy = shared.sums[side, 0], shared.planes[side, 1], shared.planes[side, 2]
+        level = shared.planes[side, 0] + shared.sums[side, 3] / count
         out.planes[t, 3 * side] = level - gx * (centre.off_x - dx) - gy * (centre.off_y - dy)
         out.planes[t, 3 * side + 1], out.planes[t, 3 * side + 2] = gx, gy
-        variance = (found.sums[side, 4] + limits.prior) / (count + 1.0)
+        variance = (shared.sums[side, 4] + limits.prior) / (count + 1.0)
         out.variance[t, side] = max(variance, limits.least)
-        out.anchor[t, side] = found.whole[side]
-    out.planes[t, 6], out.planes[t, 7] = found.whole[2], found.whole[3]
+        out.anchor[t, side] = shared.whole[side]
+    out.planes[t, 6], out.planes[t, 7] = shared.whole[2], shared.whole[3]
 
 
 @kernel
@@ -369,7 +369,7 @@ def _fill_breaklines(
         np.empty(RINGS + 1, np.int32),
     )
     planes, sums = np.empty((2, 3)), np.empty((2, 5))
-    found = _Found(np.empty((2, 3)), np.empty((2, 5)), np.empty(4, np.int64))
+    shared = _Shared(np.empty((2, 3)), np.empty((2, 5)), np.empty(4, np.int64))
     spacing, residual = limits.spacing, limits.residual
     reach, width = BREAKLINE_REACH * spacing, BAND_SPACINGS * spacing
     band = Band(reach, width, SLACK_CELLS * PART, spacing)
@@ -385,8 +385,8 @@ def _fill_breaklines(
         if leads and of_square == square[t]:
             line = _mean_line(planed, abc, lead, normal, polygons, s)
             fits = line[3] <= WIDEST_STRIP * spacing and _cuts(planed, abc, lead, line)
-            if fits and _fits_corners(planed, abc, lead, found.planes, line, residual):
-                _keep(planed, a, lead, line, found, limits, out, t)
+            if fits and _fits_corners(planed, abc, lead, shared.planes, line, residual):
+                _keep(planed, a, lead, line, shared, limits, out, t)
                 continue
         ox = float(x[b] - x[a] + x[c] - x[a]) / 3.0
         oy = float(y[b] - y[a] + y[c] - y[a]) / 3.0
@@ -412,9 +412,14 @@ def _fill_breaklines(
         if not _fits_corners(planed, abc, centre, planes, line, residual):
             continue
         leads, of_square = True, square[t]
-        found.planes[:], found.sums[:] = planes, sums
-        found.whole[0], found.whole[1], found.whole[2], found.whole[3] = low, top, least_h, most_h
-        _keep(planed, a, centre, line, found, limits, out, t)
+        for side in range(2):
+            for k in range(3):
+                shared.planes[side, k] = planes[side, k]
+            for k in range(5):
+                shared.sums[side, k] = sums[side, k]
+        shared.whole[0], shared.whole[1] = low, top
+        shared.whole[2], shared.whole[3] = least_h, most_h
+        _keep(planed, a, centre, line, shared, limits, out, t)
 
 
 def breaklines(
