@@ -34,6 +34,8 @@ _IMPORT = re.compile(  # at the start of a line: what a function imports, no ker
     r"^(?:from\s+([.\w]+)\s+import\s+(\([^)]*\)|[^\n]*)|import\s+([^\n]+))", re.MULTILINE
 )
 
+_kernels: set[Callable] = set()
+
 inner: Callable = register_jitable(**_OPTIONS)
 """A function that kernels call; plain Python where Python calls it.
 
@@ -50,6 +52,7 @@ the simulator's rays (1000 against 290 ns a ray, textures and shadows included).
 
 def kernel(function: Callable) -> Callable:
     """A compiled loop over points or pixels, which Python calls."""
+    _kernels.add(function)
     named = config.CACHE_DIR
     config.CACHE_DIR = str(folder() / sources_digest(function.__module__))
     try:
@@ -146,9 +149,14 @@ class _Compilation(Listener):
             log.info("compiling, first run only")
 
     def on_end(self, event: Event) -> None:
-        """What is compiled will be kept; or it was, with the outermost of Numba's locks."""
+        """A kernel is compiled and will be kept; or it was, with the outermost of Numba's locks.
+
+        What kernels call is compiled first and not kept: claimed from then on, processes would
+        compile one after the other.
+        """
         if event.kind == "numba:compile":
-            if getattr(self.thread, "claim", None) is None:
+            is_kernel = event.data["dispatcher"].py_func in _kernels
+            if is_kernel and getattr(self.thread, "claim", None) is None:
                 self.thread.claim = _claim()
             return
         self.thread.depth -= 1

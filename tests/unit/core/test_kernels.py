@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -159,6 +160,18 @@ def test_an_edit_of_what_a_kernel_calls_compiles_it_and_another_edit_does_not(ru
     fields = ("made/uses.py", "slope: float\n    level: float", "level: float\n    slope: float")
     assert result(run(fields)) == (45.0, True)  # fields are known by number
     assert result(run()) == (18.0, False)  # taken back
+
+
+def test_the_place_of_compiled_code_is_claimed_for_what_is_kept_alone(monkeypatch) -> None:
+    """Else processes would wait while one compiles what its kernel calls."""
+    claims = []
+    monkeypatch.setattr(kernels, "_claim", lambda: claims.append(True))
+    for function in (shifted, summed.py_func):
+        compiled = SimpleNamespace(
+            kind="numba:compile", data={"dispatcher": SimpleNamespace(py_func=function)}
+        )
+        kernels._compilation.on_end(compiled)
+        assert bool(claims) == (function is summed.py_func)
 
 
 @pytest.mark.slow
