@@ -1,8 +1,10 @@
 """Puts the workflow into the wheel, where :data:`stereotruth.project.project.FILES` finds it.
 
-In a clone, and in an editable installation, it stays at the top.
+In a clone, and in an editable installation, it stays at the top. ``STEREOTRUTH_KERNELS`` names a
+folder of compiled kernels that the wheel brings along (``make wheel``).
 """
 
+import os
 import shutil
 from pathlib import Path
 
@@ -27,6 +29,9 @@ class WithWorkflow(build_py):
         for folder in FOLDERS:
             ignored = shutil.ignore_patterns("__pycache__", "requirements.lock", "check_lock.py")
             shutil.copytree(folder, shipped / folder, ignore=ignored)
+        if kernels := os.environ.get("STEREOTRUTH_KERNELS"):
+            compiled = Path(self.build_lib, "stereotruth", "core", "compiled")
+            shutil.copytree(kernels, compiled, dirs_exist_ok=True)
         environment = shipped / "envs" / "workflow.yaml"  # names the clone around it
         named = f"- stereotruth=={self.distribution.get_version()}"
         environment.write_text(environment.read_text("utf-8").replace("- ..", named), "utf-8")
