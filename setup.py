@@ -1,9 +1,11 @@
 """Puts the workflow into the wheel, where :data:`stereotruth.project.project.FILES` finds it.
 
 In a clone, and in an editable installation, it stays at the top. The wheel's description is the
-README without what only a clone has: its picture, and links to its files.
+README without what only a clone has: its picture, and links to its files. ``STEREOTRUTH_KERNELS``
+names a folder of compiled kernels that the wheel brings along (``make wheel``).
 """
 
+import os
 import re
 import shutil
 from pathlib import Path
@@ -29,6 +31,9 @@ class WithWorkflow(build_py):
         for folder in FOLDERS:
             ignored = shutil.ignore_patterns("__pycache__")
             shutil.copytree(folder, shipped / folder, ignore=ignored)
+        if kernels := os.environ.get("STEREOTRUTH_KERNELS"):
+            compiled = Path(self.build_lib, "stereotruth", "core", "compiled")
+            shutil.copytree(kernels, compiled, dirs_exist_ok=True)
 
 
 text = Path("README.md").read_text("utf-8")

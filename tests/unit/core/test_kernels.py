@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -172,6 +173,28 @@ def test_the_place_of_compiled_code_is_claimed_for_what_is_kept_alone(monkeypatc
         )
         kernels._compilation.on_end(compiled)
         assert bool(claims) == (function is summed.py_func)
+
+
+@pytest.mark.slow
+def test_a_wheel_brings_kernels_along_for_all_processors_of_the_target(run, tmp_path) -> None:
+    """Whatever the folder in which the package is installed, and the one where it keeps them."""
+    assert result(run()) == (18.0, True)
+    (digest,) = (tmp_path / "kernels").glob("*/")
+    shipped, elsewhere = tmp_path / "shipped", tmp_path / "elsewhere"
+    (tmp_path / "kernels").rename(shipped)
+    for name in FILES:
+        (elsewhere / name).parent.mkdir(exist_ok=True, parents=True)
+        shutil.move(tmp_path / name, elsewhere / name)
+    main = elsewhere / "main.py"
+    ship = (
+        f"from stereotruth.core import kernels\nkernels.SHIPPED = kernels.Path({str(shipped)!r})\n"
+    )
+    main.write_text(ship + main.read_text())
+    command = [sys.executable, "main.py", "float64"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(elsewhere), "PYTHONDONTWRITEBYTECODE": "1"}
+    text = subprocess.check_output(command, cwd=elsewhere, env=environment, text=True)
+    assert text.split() == ["18.0", "18.0"]  # and not a word of compiling
+    assert (elsewhere / "kernels" / digest.name).is_dir()
 
 
 @pytest.mark.slow
