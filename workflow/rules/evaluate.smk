@@ -91,7 +91,7 @@ rule evaluate:
         [
             f"results/evaluate/{s.city}/{s.scene}/truth.json"
             for s in SCENES.values()
-            if is_synthetic(s)
+            if has_truth(s)
         ],
         [f"results/evaluate/{city}/truth.json" for city in CITIES if synthetic_scenes(city)],
         [f"results/evaluate/{s.city}/table4.csv" for s in SCENES.values()],

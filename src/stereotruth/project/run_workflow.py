@@ -57,6 +57,7 @@ WITHOUT_SCENES = re.compile(
 
 EXAMPLE = "--example"  # the synthetic cities that come with the package
 CONFIG_OPTIONS = ("--configfile", "--configfiles")
+OWN_WORDS = re.compile(r"--(logger|verbose)(=|$)")  # who asks for Snakemake's own gets them
 CORES = re.compile(r"--(cores|jobs|profile|executor)(=|$)|-[cj]")
 
 
@@ -209,4 +210,5 @@ def run_workflow(given: Sequence[str]) -> None:
         by_option = any(word.startswith("scenes=") for word in given)  # of --config
         if not by_option and need_scenes(given, files):
             require_scenes(files)
-    os.execv(sys.executable, [sys.executable, "-m", "snakemake", *arguments])
+    news = [] if any(map(OWN_WORDS.match, given)) else ["--logger", "stereotruth"]
+    os.execv(sys.executable, [sys.executable, "-m", "snakemake", *news, *arguments])

@@ -1,4 +1,7 @@
-"""What is made of each city, and what a run would make and why: asked of Snakemake's own plan."""
+"""What is made of each city, and what a run would make and why: asked of Snakemake's own plan.
+
+And how two folders of results differ.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,15 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.markup import escape
+from rich.table import Table
 
 from ..core.errors import InputError
+from ..core.products.files import read_json
 from ..evaluate.report.index_page import PAGES
+from ..tiles.label_moves import moves, sample_labels, worst_point
 from ..tiles.manifest import read_manifest
 from .findings import plain_table, wide
 from .project import configured, read_scenes, require_scenes, sheet
@@ -23,6 +30,13 @@ from .run_workflow import arguments_for
 
 FOLLOWS = "Input files updated by another job"  # of a job that runs because another does
 LONGEST = 300  # characters of a reason
+MISSING = "Missing output files"  # of what was never made
+# Rules of figures and pages, which tiles are up to date without.
+AFTER_TILES = {
+    "evaluate_images", "evaluate_truth", "evaluate_truth_city", "grid_truth", "report_city",
+}  # fmt: skip
+TO_DO = "a run of tiles, evaluate and report would do, and why"
+ALIGNMENTS = "adjust/{}/alignment.json", "refine/{}/alignment.json", "align/{}/alignment.json"
 # How Snakemake says that params differ, and what stands in these; ``code``, and what stands in
 # ``sources``, are digests (workflow/rules/sources.smk).
 PARAMS = re.compile(r"Params have changed .*?before: (.*) now: (.*)")
@@ -95,7 +109,7 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
 
 @dataclass(frozen=True)
 class CityStatus:
-    """A city's tiles and pages, and what a run of its tiles would do."""
+    """A city's tiles and pages, and what a run of tiles, `evaluate` and `report` would do."""
 
     city: str
     made: str
@@ -104,8 +118,8 @@ class CityStatus:
 
     @property
     def state(self) -> str:
-        """In a few words."""
-        if not self.jobs:
+        """Of the tiles, in a few words."""
+        if all(job.rule in AFTER_TILES for job in self.jobs):
             return "up to date"
         return "out of date" if self.made else "not made"
 
@@ -118,7 +132,8 @@ class CityStatus:
         causes: dict[str, list[str]] = {}
         for job in self.jobs:
             for cause in job.causes:
-                if self.made or not cause.startswith("Missing output files"):
+                expected = not self.made or job.rule in AFTER_TILES
+                if not (expected and cause.startswith(MISSING)):
                     causes.setdefault(_short(cause), []).append(f"{job.rule} {job.of}".strip())
         for cause, of in causes.items():
             more = f" and {len(of) - 2} more" if len(of) > 2 else ""
@@ -190,7 +205,9 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
             file=sheet(settings, "scenes"),
             remedy="stereotruth scene add DELIVERY --lidar FOLDER",
         )
-    jobs = plan([f"tiles/{city}" for city in wanted], configfiles)
+    of_city = "tiles/{0}", "results/report/{0}/index.html"
+    targets = [target.format(city) for city in wanted for target in of_city]
+    jobs = plan([*targets, "evaluate"], configfiles)
     pages = [page for pattern in PAGES for page in Path().glob(pattern)]
     return [
         CityStatus(
@@ -206,10 +223,54 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
 def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> None:
     """Print a table of the cities."""
     every = status_of(cities, configfiles)
-    table = plain_table(("city", "tiles", "made", "page", "a run would do, and why"))
+    table = plain_table(("city", "tiles", "made", "page", TO_DO))
     for city in every:
         style = "green" if city.state == "up to date" else "yellow"
         page = ", ".join(city.pages) or "none"
         row = (city.city, f"[{style}]{city.state}[/{style}]", city.made or "none", page)
         table.add_row(*row, "\n".join(map(escape, city.why())))
     wide().print(table)
+
+
+def _results(folder: Path) -> Path:
+    """The results in a folder, or in a project's. Raises InputError if it has no labels."""
+    for place in (folder, folder / "results"):
+        if any(place.glob("project/*/*.zarr")):
+            return place
+    raise InputError(
+        "no labels in it (project/<City>/<scene>.zarr)",
+        file=folder,
+        remedy="name a folder `results`, or that of a project that has run",
+    )
+
+
+def compare(old: Path, new: Path) -> Table:
+    """A table of the scenes that two folders of results share: how far labels have moved from the
+    ``old`` to the ``new``, and the control points of both. Raises InputError if they share none."""
+    before, after = _results(old), _results(new)
+    headings = ("scene", "labels, px of disparity", "95 %, px", "control points, px rms", "worst")
+    table = plain_table(headings, whole=("scene",))
+    for store in sorted(after.glob("project/*/*.zarr")):
+        if not (before / store.relative_to(after)).is_dir():
+            continue
+        found = moves(sample_labels(before / store.relative_to(after)), store)
+        name = f"{store.parent.name}/{store.stem}"
+        records = [_alignment(results, name) for results in (before, after)]
+        rms = " -> ".join(map(_rms, records))
+        cells = str(found or "none before"), f"{found.p95_px:.3f}" if found else ""
+        table.add_row(*map(escape, (name, *cells, rms, str(worst_point(records[1]) or ""))))
+    if not table.row_count:
+        raise InputError("no scene that both have", file=new, remedy=f"compare it with {old}'s own")
+    return table
+
+
+def _alignment(results: Path, scene: str) -> Mapping[str, Any]:
+    """The last record of a scene's alignment; empty without any."""
+    files = (results / name.format(scene) for name in ALIGNMENTS)
+    return next((read_json(file) for file in files if file.is_file()), {})
+
+
+def _rms(record: Mapping[str, Any]) -> str:
+    """Of the control points' residuals, left and right image."""
+    views = (record.get(view, {}).get("rms", {}).get("after") for view in ("left", "right"))
+    return ", ".join("–" if value is None else f"{value:.3f}" for value in views)

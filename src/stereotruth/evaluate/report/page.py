@@ -63,14 +63,16 @@ FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and 
 class CityFiles:
     """Files of a city; a section of the page is left out whose file is None or missing.
 
-    ``tiles``: the exported tiles; ``coverage``: the coverage map (PNG); ``looks``: georeferenced
-    pictures of the left images by scene; ``alignments``, ``refinements``: alignment.json by scene,
+    ``tiles``: the exported tiles; ``summary``: what the last lines of a run say of them;
+    ``coverage``: the coverage map (PNG); ``looks``: georeferenced pictures of the left images by
+    scene; ``alignments``, ``refinements``: alignment.json by scene,
     after the fit to the GCPs and after refinement, with their figures (PNG) ``residual_figures``
     and ``refinement_figures``; ``truth``, ``truth_table``: truth.json and truth.csv; ``table4``,
     ``sift``: table4.csv and sift.csv with their ``sift_figure`` (PNG).
     """
 
     tiles: Place
+    summary: Place | None = None
     coverage: Place | None = None
     looks: Mapping[str, Place] = field(default_factory=dict)
     alignments: Mapping[str, Place] = field(default_factory=dict)
@@ -147,7 +149,14 @@ def write_report(
     values = {
         "city": city,
         "index": way(out, index),
-        "headlines": headlines(rows, alignments, refined, truth_rows, export, height),
+        "headlines": headlines(
+            rows,
+            alignments,
+            refined,
+            truth_rows,
+            export | {"since_last_run": _record(files.summary).get("since_last_run", {})},
+            height,
+        ),
         "sizes": sizes,
         "height_m_per_px": height,
         "links": files.links(out),

@@ -1,0 +1,141 @@
+"""What ``stereotruth run`` shows of a run, by Snakemake's interface for loggers: `--logger
+stereotruth`. One line for each job that is done, with the time that the others will take; of a dry
+run a table of its rules. All else is in the logs: of Snakemake (.snakemake/log) and of the jobs.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import statistics
+import sys
+import time
+from typing import Any
+
+from snakemake_interface_logger_plugins.base import LogHandlerBase
+from snakemake_interface_logger_plugins.common import LogEvent
+
+from stereotruth.core.job import NEWS_ONLY, failure_of, in_time
+
+COLUMNS = "rule", "jobs", "cores", "MB", "minutes"
+RESOURCES = "mem_mb", "runtime"
+
+
+class LogHandler(LogHandlerBase):
+    """Hears of a run what Snakemake says to its loggers, and prints what users want to know."""
+
+    writes_to_stream, writes_to_file, needs_rulegraph = True, False, False
+    has_filter, has_formatter = True, True
+
+    def __post_init__(self) -> None:
+        dry = self.common_settings.dryrun
+        self.stream = sys.stdout if dry or self.common_settings.stdout else sys.stderr
+        self.counts: dict[str, int] = {}  # jobs of the run by rule, its total too
+        self.asked = self.failed = False
+        self.done = 0
+        self.jobs: dict[int, tuple[logging.LogRecord, float]] = {}  # with the time of their start
+        self.took: dict[str, list[float]] = {}  # s, of finished jobs by rule
+        self.began = time.monotonic()
+        os.environ[NEWS_ONLY] = "1"  # for the jobs
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print what a record means, if it is news."""
+        event = getattr(record, "event", None)
+        if event == LogEvent.WORKFLOW_STARTED:
+            self.asked = True
+        elif event == LogEvent.RUN_INFO:
+            self._begin(dict(getattr(record, "stats", None) or {}))
+        elif event == LogEvent.JOB_INFO:
+            self.jobs[record.jobid] = record, time.monotonic()
+        elif event == LogEvent.JOB_FINISHED:
+            self._finished(record.job_id)
+        elif event == LogEvent.JOB_ERROR:
+            self._failed_job(record)
+        elif record.levelno >= logging.WARNING and record.getMessage().strip():
+            self.failed = self.failed or record.levelno >= logging.ERROR
+            self._say(record.getMessage())
+
+    def close(self) -> None:
+        """At the end of a run: the table of a dry one, or that there was nothing to do."""
+        if self.asked and not self.failed:
+            if not self.counts:
+                self._say("Nothing to do: all is there and up to date")
+            elif self.common_settings.dryrun:
+                self._say(self._table())
+        self.asked = False
+        super().close()
+
+    def _say(self, text: str) -> None:
+        encoding = self.stream.encoding or "ascii"
+        print(text.encode(encoding, "replace").decode(encoding), file=self.stream, flush=True)
+
+    def _begin(self, counts: dict[str, int]) -> None:
+        if self.common_settings.dryrun or self.counts:
+            self.counts = counts
+            return
+        self.counts = counts
+        rules = ", ".join(f"{rule} {n}" for rule, n in counts.items() if rule != "total")
+        self._say(f"{self.total} jobs: {rules}")
+
+    @property
+    def total(self) -> int:
+        """Jobs of the run."""
+        return sum(n for rule, n in self.counts.items() if rule != "total")
+
+    def _finished(self, number: int) -> None:
+        record, start = self.jobs.pop(number, (None, 0.0))
+        self.done += 1
+        if record is None or not record.log or self.common_settings.quiet:
+            return  # a job without a log makes nothing: a target of several products
+        seconds = time.monotonic() - start
+        self.took.setdefault(record.rule_name, []).append(seconds)
+        parts = [f"{self.done} of {self.total}", in_time(seconds)]
+        if left := self._seconds_left():
+            parts.append(f"about {in_time(left)} left")
+        self._say(f"Done: {_name(record)} ({'; '.join(parts)})")
+
+    def _seconds_left(self) -> float:
+        """By the mean time of each rule's jobs, of other rules the mean of all, at the pace of the
+        run so far; 0 if nothing is left."""
+        if self.done >= self.total:
+            return 0.0
+        every = [s for of in self.took.values() for s in of]
+        usual = statistics.fmean(every)
+        left = sum(
+            (n - len(self.took.get(rule, ()))) * statistics.fmean(self.took.get(rule, [usual]))
+            for rule, n in self.counts.items()
+            if rule != "total"
+        )
+        return left * (time.monotonic() - self.began) / max(sum(every), 1e-9)
+
+    def _failed_job(self, record: logging.LogRecord) -> None:
+        self.failed = True
+        if not any(failure_of(log) for log in record.log):
+            self._say(
+                f"Failed: {_name(record)}, and does not say why, as a job that is killed, for its "
+                f"memory or its time. Look at {', '.join(map(str, record.log)) or 'no log'}"
+            )
+
+    def _table(self) -> str:
+        """What a dry run would do: of each rule its jobs, and the most that one job may take."""
+        rules: dict[str, list[float]] = {}
+        for record, _ in self.jobs.values():
+            row = rules.setdefault(record.rule_name, [0, 0, 0, 0])
+            of = dict(record.resources.items())
+            most = [record.threads, *(of.get(name) for name in RESOURCES)]
+            known = [value if isinstance(value, int | float) else 0 for value in most]
+            row[:] = [row[0] + 1, *map(max, row[1:], known)]
+        rows = [COLUMNS, *((rule, *map(str, row)) for rule, row in rules.items())]
+        rows.append(("all", str(len(self.jobs)), "", "", ""))
+        widths = [max(map(len, column)) for column in zip(*rows)]
+        lines = [
+            "  ".join((rule.ljust(widths[0]), *map(str.rjust, cells, widths[1:]))).rstrip()
+            for rule, *cells in rows
+        ]
+        return "\n".join([*lines, "Cores, MB and minutes: of one job, at most. This was a dry run"])
+
+
+def _name(record: logging.LogRecord) -> str:
+    """What a job does, as its rule says it."""
+    message: Any = record.rule_msg
+    return message or record.rule_name
