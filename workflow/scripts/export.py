@@ -10,8 +10,9 @@ from stereotruth.core.products.files import atomic_file, read_json
 from stereotruth.core.products.making import rule_job
 from stereotruth.tiles.export import Extras, export_city
 from stereotruth.tiles.label_moves import edit_lines, keep_samples, since_last_run
+from stereotruth.tiles.manifest import read_manifest
 from stereotruth.tiles.scene_stores import SceneFiles
-from stereotruth.tiles.tile_checks import summary_lines
+from stereotruth.tiles.tile_checks import misfit_lines, summary_lines
 from stereotruth.tiles.tile_files import City
 
 if __name__ == "__main__":
@@ -43,6 +44,7 @@ if __name__ == "__main__":
         stores = dict(zip(snakemake.params.scenes, given.disparity))
         moved = since_last_run(stores)
         *lines, look = summary_lines(summary, snakemake.output.tiles)
+        lines += misfit_lines(read_manifest(snakemake.output.tiles))
         summary["lines"] = [*lines, *edit_lines(moved, map(read_json, given.alignment)), look]
         summary["since_last_run"] = {scene: asdict(found) for scene, found in moved.items()}
         with atomic_file(snakemake.output.summary) as scratch:

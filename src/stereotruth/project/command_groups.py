@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from ..core.errors import InputError
 
 scene_app = typer.Typer(no_args_is_help=True, help="The scenes of the project.")
 gcps_app = typer.Typer(no_args_is_help=True, help="Ground control points.")
@@ -23,6 +26,32 @@ AllowedHosts = Annotated[
 def examples(*lines: str) -> str:
     """What stands at the end of a command's help, one line each."""
     return "\n\n".join(["[bold]Examples[/bold]", *(f"[cyan]{line}[/cyan]" for line in lines)])
+
+
+def complete_targets(context: typer.Context) -> list[str]:
+    """For the shell: what may follow in `stereotruth run`; nothing where there is no project."""
+    from .run_workflow import completions
+
+    with suppress(InputError, OSError):
+        return completions(context.params.get("given") or [])
+    return []
+
+
+def complete_profiles(context: typer.Context) -> list[str]:
+    """For the shell: the profiles of the package."""
+    del context
+    from .run_workflow import completions
+
+    return completions(["--profile"])
+
+
+def complete_cities(context: typer.Context) -> list[str]:
+    """For the shell: cities of the project."""
+    return [
+        target.removeprefix("tiles/")
+        for target in complete_targets(context)
+        if target.startswith("tiles/")
+    ]
 
 
 def print_lines(lines: Iterable[str]) -> None:

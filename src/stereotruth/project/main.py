@@ -16,6 +16,9 @@ from ..core.errors import InputError, told_by_system
 from .command_groups import (
     AllowedHosts,
     Configured,
+    complete_cities,
+    complete_profiles,
+    complete_targets,
     examples,
     gcps_app,
     print_lines,
@@ -182,7 +185,10 @@ def lidar_tiles(
 )
 def check(
     scenes: Annotated[
-        list[str] | None, typer.Argument(help="Scenes or cities; all if none is named.")
+        list[str] | None,
+        typer.Argument(
+            help="Scenes or cities; all if none is named.", autocompletion=complete_cities
+        ),
     ] = None,
     configfile: Configured = None,
 ) -> None:
@@ -202,7 +208,9 @@ def check(
     )
 )
 def pairs(
-    city: Annotated[str, typer.Argument(help="City of the images sheet.")],
+    city: Annotated[
+        str, typer.Argument(help="City of the images sheet.", autocompletion=complete_cities)
+    ],
     most: Annotated[int | None, typer.Option(min=1, help="Write the best so many.")] = None,
     convergence: Annotated[
         tuple[float, float], typer.Option(help="Write pairs from … to degrees of convergence.")
@@ -211,7 +219,8 @@ def pairs(
         tuple[float, float] | None, typer.Option(help="Write pairs from … to days apart.")
     ] = None,
     diachronic: Annotated[
-        bool, typer.Option("--diachronic", help="Write pairs more than 30 days apart.")
+        bool,
+        typer.Option("--diachronic", help="Write pairs of two lights: by suns, or over 30 days."),
     ] = False,
     each: Annotated[
         int | None, typer.Option(min=1, help="Write at most so many pairs of each image.")
@@ -240,7 +249,7 @@ def pairs(
 
 @app.command(
     context_settings=PASSED_ON,
-    options_metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]",
+    options_metavar="",
     help="Run the workflow in this folder, with its config.yaml; without a target it makes the "
     "tiles of all cities. [cyan]stereotruth targets[/cyan] lists what can be made. Any option goes "
     "to Snakemake as it is; where none says how many cores, it takes all. "
@@ -252,14 +261,24 @@ def pairs(
         "stereotruth run benchmark/synthetic/sgm -- --keep-going",
     ),
 )
-def run(context: typer.Context) -> None:
+def run(
+    context: typer.Context,
+    given: Annotated[
+        list[str] | None,
+        typer.Argument(
+            hidden=True,
+            metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]",
+            autocompletion=complete_targets,
+        ),
+    ] = None,
+) -> None:
     """Run the workflow; see ``help`` above."""
     from .run_workflow import run_workflow
 
-    if context.args in (["--help"], ["-h"]):
+    if given in (["--help"], ["-h"]):
         typer.echo(context.get_help())
         raise typer.Exit
-    run_workflow(context.args)
+    run_workflow(given or [])
 
 
 @app.command(epilog=examples("stereotruth targets", "stereotruth run report"))
@@ -278,7 +297,12 @@ def targets(configfile: Configured = None) -> None:
     )
 )
 def profile(
-    name: Annotated[str, typer.Argument(help="The profile; without one, list them.")] = "",
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="The profile; without one, list them.", autocompletion=complete_profiles
+        ),
+    ] = "",
     folder: Annotated[
         Path | None, typer.Argument(help="Folder to be written; else the profile's name.")
     ] = None,
@@ -291,7 +315,10 @@ def profile(
 
 @app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))
 def status(
-    cities: Annotated[list[str] | None, typer.Argument(help="All if none is named.")] = None,
+    cities: Annotated[
+        list[str] | None,
+        typer.Argument(help="All if none is named.", autocompletion=complete_cities),
+    ] = None,
     configfile: Configured = None,
 ) -> None:
     """Say what is made of each city, and what is out of date and why."""

@@ -20,10 +20,11 @@ import numpy as np
 from ...core.errors import InputError
 from ...core.job import progress
 from ...core.products.files import read_table
+from ...core.status import Status
 from ...pages.page import way, write_page
 from ...pages.pictures import DISPARITIES, Scale, encode_file
 from ...pages.tables import minus, missed, table
-from ...tiles.manifest import NONE, SPLITS, read_manifest
+from ...tiles.manifest import NONE, SPLITS, read_manifest, tells_of_change
 from ...tiles.orientation import PixelSize
 from ...tiles.quick_looks import SPLIT_COLOURS, status_colours
 from .city_pictures import (
@@ -55,6 +56,7 @@ MOST_BYTES = {"figures": 600_000, "thumbnails": 24_000, "sliders": 200_000}  # o
 COVERAGE_PX, FIGURE_PX, THUMBNAIL_PX, SLIDER_PX = 2200, 1400, 320, 900
 KINDS = ("left", "right", "disparity", "status")
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
+CHANGED, MISFIT = Status.CHANGED.label, "does_not_fit_the_images"
 FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest
 FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and these come first
 
@@ -241,7 +243,10 @@ def _of_tiles(
         "disparities": limits and Scale.of(DISPARITIES, *(minus(f"{v:.0f} px") for v in limits)),
         "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
         "statuses": _shares(every),
-        "status_colours": status_colours(list(every)),
+        "status_colours": {
+            MISFIT: Status.CHANGED.colour,
+            **status_colours([name for name in every if name != MISFIT]),
+        },
         "shares": {tile: _shares(counts) for tile, counts in statuses.items()},
         "split_colours": SPLIT_COLOURS,
         "no_match": f"rgb{NO_MATCH}",
@@ -296,14 +301,17 @@ def _pixel_sizes(folder: Path, labelled: Sequence[Row]) -> dict[str, PixelSize]:
 
 
 def status_counts(row: Row) -> Counter[str]:
-    """Pixels of a tile by status."""
-    return Counter(
+    """Pixels of a tile by status; what is `changed` where nothing tells of a change, as MISFIT."""
+    counts = Counter(
         {
             name.removeprefix("count_"): int(value)
             for name, value in row.items()
             if name.startswith("count_") and value
         }
     )
+    if CHANGED in counts and not tells_of_change(row):
+        counts[MISFIT] = counts.pop(CHANGED)
+    return counts
 
 
 def _shares(counts: Counter[str]) -> dict[str, float]:
