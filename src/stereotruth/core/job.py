@@ -49,7 +49,8 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     path = Path(log_file)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)  # a job of an earlier run may still write into the old one
-    _failure_file(path).unlink(missing_ok=True)  # of an attempt before this one
+    with suppress(OSError):  # of an attempt before this one
+        _failure_file(path).unlink()
     terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, "w", "utf-8")
     terminal.setFormatter(_Discreet(f"{name}: %(message)s"))
     file.setFormatter(_Discreet(f"%(asctime)s %(levelname)s {name}: %(message)s"))

@@ -220,7 +220,7 @@ def pairs(
     ] = None,
     diachronic: Annotated[
         bool,
-        typer.Option("--diachronic", help="Write pairs of two lights: by suns, or over 30 days."),
+        typer.Option("--diachronic", help="Write pairs of two lights, by suns or over 30 days."),
     ] = False,
     each: Annotated[
         int | None, typer.Option(min=1, help="Write at most so many pairs of each image.")

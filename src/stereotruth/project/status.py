@@ -33,7 +33,8 @@ LONGEST = 300  # characters of a reason
 MISSING = "Missing output files"  # of what was never made
 # Rules of figures and pages, which tiles are up to date without.
 AFTER_TILES = {
-    "evaluate_images", "evaluate_truth", "evaluate_truth_city", "grid_truth", "report_city",
+    "draw_residuals", "draw_refinement", "evaluate_images", "evaluate_truth",
+    "evaluate_truth_city", "grid_truth", "report_city", "simulate_truth",
 }  # fmt: skip
 TO_DO = "a run of tiles, evaluate and report would do, and why"
 ALIGNMENTS = "adjust/{}/alignment.json", "refine/{}/alignment.json", "align/{}/alignment.json"
@@ -127,10 +128,11 @@ class CityStatus:
         """What a run would do, and the causes of it, the most frequent first."""
         if not self.jobs:
             return []
-        rules = Counter(job.rule for job in self.jobs)
+        jobs = sorted(self.jobs, key=lambda job: job.rule in AFTER_TILES)
+        rules = Counter(job.rule for job in jobs)
         lines = [", ".join(f"{rule} {count}" for rule, count in rules.items())]
         causes: dict[str, list[str]] = {}
-        for job in self.jobs:
+        for job in jobs:
             for cause in job.causes:
                 expected = not self.made or job.rule in AFTER_TILES
                 if not (expected and cause.startswith(MISSING)):
