@@ -119,14 +119,15 @@ class LogHandler(LogHandlerBase):
     def _table(self) -> str:
         """What a dry run would do: of each rule its jobs, and the most that one job may take."""
         rules: dict[str, list[float]] = {}
-        for record, _ in self.jobs.values():
+        jobs = [record for record, _ in self.jobs.values() if record.log]  # others make nothing
+        for record in jobs:
             row = rules.setdefault(record.rule_name, [0, 0, 0, 0])
             of = dict(record.resources.items())
             most = [record.threads, *(of.get(name) for name in RESOURCES)]
             known = [value if isinstance(value, int | float) else 0 for value in most]
             row[:] = [row[0] + 1, *map(max, row[1:], known)]
         rows = [COLUMNS, *((rule, *map(str, row)) for rule, row in rules.items())]
-        rows.append(("all", str(len(self.jobs)), "", "", ""))
+        rows.append(("all", str(len(jobs)), "", "", ""))
         widths = [max(map(len, column)) for column in zip(*rows)]
         lines = [
             "  ".join((rule.ljust(widths[0]), *map(str.rjust, cells, widths[1:]))).rstrip()
