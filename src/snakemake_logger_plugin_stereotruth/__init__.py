@@ -19,6 +19,8 @@ from stereotruth.core.job import NEWS_ONLY, failure_of, in_time
 
 COLUMNS = "rule", "jobs", "cores", "MB", "minutes"
 RESOURCES = "mem_mb", "runtime"
+# Rules that name the products of others, and take no time.
+WITHOUT_JOB = {"all", "benchmark", "closure", "evaluate", "heights", "index", "predict", "report"}
 
 
 class LogHandler(LogHandlerBase):
@@ -30,7 +32,7 @@ class LogHandler(LogHandlerBase):
     def __post_init__(self) -> None:
         dry = self.common_settings.dryrun
         self.stream = sys.stdout if dry or self.common_settings.stdout else sys.stderr
-        self.counts: dict[str, int] = {}  # jobs of the run by rule, its total too
+        self.counts: dict[str, int] = {}  # jobs of the run by rule
         self.asked = self.failed = False
         self.done = 0
         self.jobs: dict[int, tuple[logging.LogRecord, float]] = {}  # with the time of their start
@@ -44,7 +46,8 @@ class LogHandler(LogHandlerBase):
         if event == LogEvent.WORKFLOW_STARTED:
             self.asked = True
         elif event == LogEvent.RUN_INFO:
-            self._begin(dict(getattr(record, "stats", None) or {}))
+            known = dict(getattr(record, "stats", None) or {})
+            self._begin({r: n for r, n in known.items() if r not in WITHOUT_JOB | {"total"}})
         elif event == LogEvent.JOB_INFO:
             self.jobs[record.jobid] = record, time.monotonic()
         elif event == LogEvent.JOB_FINISHED:
@@ -70,26 +73,19 @@ class LogHandler(LogHandlerBase):
         print(text.encode(encoding, "replace").decode(encoding), file=self.stream, flush=True)
 
     def _begin(self, counts: dict[str, int]) -> None:
-        if self.common_settings.dryrun or self.counts:
-            self.counts = counts
-            return
+        if not self.common_settings.dryrun and not self.counts:
+            rules = ", ".join(f"{rule} {n}" for rule, n in counts.items())
+            self._say(f"{sum(counts.values())} jobs: {rules}")
         self.counts = counts
-        rules = ", ".join(f"{rule} {n}" for rule, n in counts.items() if rule != "total")
-        self._say(f"{self.total} jobs: {rules}")
-
-    @property
-    def total(self) -> int:
-        """Jobs of the run."""
-        return sum(n for rule, n in self.counts.items() if rule != "total")
 
     def _finished(self, number: int) -> None:
         record, start = self.jobs.pop(number, (None, 0.0))
+        if record is None or record.rule_name in WITHOUT_JOB or self.common_settings.quiet:
+            return
         self.done += 1
-        if record is None or not record.log or self.common_settings.quiet:
-            return  # a job without a log makes nothing: a target of several products
         seconds = time.monotonic() - start
         self.took.setdefault(record.rule_name, []).append(seconds)
-        parts = [f"{self.done} of {self.total}", in_time(seconds)]
+        parts = [f"{self.done} of {sum(self.counts.values())}", in_time(seconds)]
         if left := self._seconds_left():
             parts.append(f"about {in_time(left)} left")
         self._say(f"Done: {_name(record)} ({'; '.join(parts)})")
@@ -97,14 +93,11 @@ class LogHandler(LogHandlerBase):
     def _seconds_left(self) -> float:
         """By the mean time of each rule's jobs, of other rules the mean of all, at the pace of the
         run so far; 0 if nothing is left."""
-        if self.done >= self.total:
-            return 0.0
         every = [s for of in self.took.values() for s in of]
         usual = statistics.fmean(every)
         left = sum(
             (n - len(self.took.get(rule, ()))) * statistics.fmean(self.took.get(rule, [usual]))
             for rule, n in self.counts.items()
-            if rule != "total"
         )
         return left * (time.monotonic() - self.began) / max(sum(every), 1e-9)
 
@@ -119,7 +112,8 @@ class LogHandler(LogHandlerBase):
     def _table(self) -> str:
         """What a dry run would do: of each rule its jobs, and the most that one job may take."""
         rules: dict[str, list[float]] = {}
-        jobs = [record for record, _ in self.jobs.values() if record.log]  # others make nothing
+        every = (record for record, _ in self.jobs.values())
+        jobs = [record for record in every if record.rule_name not in WITHOUT_JOB]
         for record in jobs:
             row = rules.setdefault(record.rule_name, [0, 0, 0, 0])
             of = dict(record.resources.items())

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import logging
+import re
 from types import SimpleNamespace
 
 import pytest
 from snakemake_interface_logger_plugins.common import LogEvent
 from snakemake_interface_logger_plugins.tests import MockOutputSettings
 
-from snakemake_logger_plugin_stereotruth import LogHandler
+from snakemake_logger_plugin_stereotruth import WITHOUT_JOB, LogHandler
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import job
 from stereotruth.core.products.making import begin_notes
+
+from ..synthetic.project import ROOT
 
 
 @pytest.fixture
@@ -58,17 +61,24 @@ def job_of(number: int, rule: str, **resources: int) -> dict:
 def test_one_line_for_each_job_that_is_done_and_none_for_what_snakemake_says_besides(run):
     now = run()
     now.tell(None, msg="Building DAG of jobs...")
-    now.tell("RUN_INFO", stats={"align": 2, "report": 1, "total": 3})
+    now.tell("RUN_INFO", stats={"align": 3, "report": 1, "total": 4})
     for number in (1, 2):
         now.tell("JOB_INFO", **job_of(number, "align"))
     now.tell("JOB_FINISHED", job_id=1)
     now.tell("JOB_FINISHED", job_id=2)
-    now.tell("JOB_INFO", **job_of(3, "report") | {"log": []})
+    now.tell("JOB_INFO", **job_of(3, "report"))
     now.tell("JOB_FINISHED", job_id=3)
     begin, first, second = now.said()
-    assert "3 jobs" in begin and "align 2" in begin
+    assert "3 jobs" in begin and "align 3" in begin and "report" not in begin
     assert "align number 1" in first and "1 of 3" in first and "left" in first
     assert "align number 2" in second and "2 of 3" in second
+
+
+def test_rules_without_a_job_are_known():
+    files = [*(ROOT / "workflow/rules").glob("*.smk"), ROOT / "Snakefile"]
+    text = "".join(file.read_text(encoding="utf-8") + "\n\n" for file in files)
+    rules = re.findall(r"^rule (\w+):\n((?:(?: .*)?\n)+)", text, flags=re.MULTILINE)
+    assert {name for name, body in rules if "    script:" not in body} == WITHOUT_JOB
 
 
 def test_a_dry_run_is_a_table_of_its_rules(run):

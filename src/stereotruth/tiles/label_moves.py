@@ -65,7 +65,8 @@ class Moves:
     gone_share: float
 
     def __str__(self) -> str:
-        gone = f"; {100 * self.gone_share:.1f} % of them are gone" if self.gone_share else ""
+        share = f"{100 * self.gone_share:.1f} %"
+        gone = "" if share == "0.0 %" else f"; {share} of them are gone"
         if not self.count:
             return "has none of its labels left"
         if self.most_px < STILL_PX:

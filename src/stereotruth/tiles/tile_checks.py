@@ -24,7 +24,7 @@ from .manifest import tells_of_change
 from .sift_matches import FIGURES, SIFT_NOISE_PX, TileMatches
 
 ALONE = (*HIDDEN, Status.OUT_OF_FRAME.label)  # pixels that one image has alone
-MISFIT_SHARE = 0.02  # of the pixels that do not fit their images: more is told
+MISFIT_SHARE = 0.05  # of the pixels that do not fit their images: more is told
 SIGMA_COLUMNS = ("uncertainty_median_px", "uncertainty_p95_px")
 CHECK_COLUMNS = (*FIGURES, "warp_correlation", *SIGMA_COLUMNS)
 SIGMA_ENDS_PX = np.geomspace(1e-3, 10.0, 257)  # of the bins in which uncertainties are counted
