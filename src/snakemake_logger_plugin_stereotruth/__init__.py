@@ -10,12 +10,11 @@ import os
 import statistics
 import sys
 import time
-from typing import Any
 
 from snakemake_interface_logger_plugins.base import LogHandlerBase
 from snakemake_interface_logger_plugins.common import LogEvent
 
-from stereotruth.core.job import NEWS_ONLY, failure_of, in_time
+from stereotruth.core.job import NEWS_ONLY, failure_file, in_time
 
 COLUMNS = "rule", "jobs", "cores", "MB", "minutes"
 RESOURCES = "mem_mb", "runtime"
@@ -49,7 +48,8 @@ class LogHandler(LogHandlerBase):
             known = dict(getattr(record, "stats", None) or {})
             self._begin({r: n for r, n in known.items() if r not in WITHOUT_JOB | {"total"}})
         elif event == LogEvent.JOB_INFO:
-            self.jobs[record.jobid] = record, time.monotonic()
+            if record.rule_name not in WITHOUT_JOB:
+                self.jobs[record.jobid] = record, time.monotonic()
         elif event == LogEvent.JOB_FINISHED:
             self._finished(record.job_id)
         elif event == LogEvent.JOB_ERROR:
@@ -64,13 +64,12 @@ class LogHandler(LogHandlerBase):
             if not self.counts:
                 self._say("Nothing to do: all is there and up to date")
             elif self.common_settings.dryrun:
-                self._say(self._table())
+                self._show_table()
         self.asked = False
         super().close()
 
     def _say(self, text: str) -> None:
-        encoding = self.stream.encoding or "ascii"
-        print(text.encode(encoding, "replace").decode(encoding), file=self.stream, flush=True)
+        print(text, file=self.stream, flush=True)
 
     def _begin(self, counts: dict[str, int]) -> None:
         if not self.common_settings.dryrun and not self.counts:
@@ -80,7 +79,7 @@ class LogHandler(LogHandlerBase):
 
     def _finished(self, number: int) -> None:
         record, start = self.jobs.pop(number, (None, 0.0))
-        if record is None or record.rule_name in WITHOUT_JOB or self.common_settings.quiet:
+        if record is None or self.common_settings.quiet:
             return
         self.done += 1
         seconds = time.monotonic() - start
@@ -103,34 +102,33 @@ class LogHandler(LogHandlerBase):
 
     def _failed_job(self, record: logging.LogRecord) -> None:
         self.failed = True
-        if not any(failure_of(log) for log in record.log):
+        if not any(failure_file(log).exists() for log in record.log):
+            logs = ", ".join(map(str, record.log)) or "no log"
             self._say(
-                f"Failed: {_name(record)}, and does not say why, as a job that is killed, for its "
-                f"memory or its time. Look at {', '.join(map(str, record.log)) or 'no log'}"
+                f"Failed: {_name(record)}, and does not say why, as a job that is killed for its "
+                f"memory or its time. Look at {logs}"
             )
 
-    def _table(self) -> str:
+    def _show_table(self) -> None:
         """What a dry run would do: of each rule its jobs, and the most that one job may take."""
+        from rich.console import Console
+
+        from stereotruth.project.findings import plain_table, wide
+
         rules: dict[str, list[float]] = {}
-        every = (record for record, _ in self.jobs.values())
-        jobs = [record for record in every if record.rule_name not in WITHOUT_JOB]
-        for record in jobs:
+        for record, _ in self.jobs.values():
             row = rules.setdefault(record.rule_name, [0, 0, 0, 0])
             of = dict(record.resources.items())
             most = [record.threads, *(of.get(name) for name in RESOURCES)]
             known = [value if isinstance(value, int | float) else 0 for value in most]
             row[:] = [row[0] + 1, *map(max, row[1:], known)]
-        rows = [COLUMNS, *((rule, *map(str, row)) for rule, row in rules.items())]
-        rows.append(("all", str(len(jobs)), "", "", ""))
-        widths = [max(map(len, column)) for column in zip(*rows)]
-        lines = [
-            "  ".join((rule.ljust(widths[0]), *map(str.rjust, cells, widths[1:]))).rstrip()
-            for rule, *cells in rows
-        ]
-        return "\n".join([*lines, "Cores, MB and minutes: of one job, at most. This was a dry run"])
+        table = plain_table(COLUMNS)
+        for rule, numbers in rules.items():
+            table.add_row(rule, *map(str, numbers))
+        table.add_row("all", str(sum(row[0] for row in rules.values())))
+        wide(Console(file=self.stream, highlight=False)).print(table)
+        self._say("Cores, MB and minutes: of one job, at most. This was a dry run")
 
 
 def _name(record: logging.LogRecord) -> str:
-    """What a job does, as its rule says it."""
-    message: Any = record.rule_msg
-    return message or record.rule_name
+    return record.rule_msg or record.rule_name

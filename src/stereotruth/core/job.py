@@ -18,6 +18,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)  # a job of an earlier run may still write into the old one
     with suppress(OSError):  # of an attempt before this one
-        _failure_file(path).unlink()
+        failure_file(path).unlink()
     terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, "w", "utf-8")
     terminal.setFormatter(_Discreet(f"{name}: %(message)s"))
     file.setFormatter(_Discreet(f"%(asctime)s %(levelname)s {name}: %(message)s"))
@@ -94,38 +95,31 @@ class _Discreet(logging.Formatter):
 
 def _is_news() -> Callable[[logging.LogRecord], bool]:
     """A filter: warnings, errors, progress of long work; one job of a run tells of compiling."""
-    marker, tells = RUN_NOTES / "compiling", []
+
+    @cache
+    def tells_of_compiling() -> bool:
+        try:
+            (RUN_NOTES / "compiling").touch(exist_ok=False)
+        except OSError as error:  # of another kind: no run of the workflow
+            return not isinstance(error, FileExistsError)
+        return True
 
     def chosen(record: logging.LogRecord) -> bool:
-        if record.name == "stereotruth.compiling" and not tells:
-            try:
-                marker.open("x").close()
-                tells.append(True)
-            except FileExistsError:
-                tells.append(False)
-            except OSError:  # no run of the workflow
-                tells.append(True)
         if record.name == "stereotruth.compiling":
-            return tells[0]
+            return tells_of_compiling()
         return record.levelno >= logging.WARNING or getattr(record, "news", False)
 
     return chosen
 
 
-def _failure_file(log_file: str | Path) -> Path:
+def failure_file(log_file: str | Path) -> Path:
+    """Has the error with which the job of a log has failed in this run, if it has told any."""
     return FAILED / str(log_file).replace("/", "+")
 
 
 def _note_failure(log_file: Path, text: str) -> None:
     with suppress(OSError):  # no run of the workflow, or a full disk
-        _failure_file(log_file).write_text(without_secrets(text), encoding="utf-8")
-
-
-def failure_of(log_file: str | Path) -> str:
-    """The error with which the job of a log has failed in this run; empty if it has told none."""
-    with suppress(OSError):
-        return _failure_file(log_file).read_text(encoding="utf-8")
-    return ""
+        failure_file(log_file).write_text(without_secrets(text), encoding="utf-8")
 
 
 def failures() -> list[str]:
@@ -211,31 +205,27 @@ def in_time(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
-class _Progress:
-    """Logs about every tenth part done, and how long the rest will take at this pace."""
+def _teller(total: int, what: str, unit: str = "") -> Callable[[int], None]:
+    """Logs, of so many parts done, each tenth, and how long the rest will take at this pace."""
+    began, total = time.monotonic(), max(total, 1)
 
-    def __init__(self, total: int, what: str, unit: str = "") -> None:
-        self.total, self.what, self.unit = max(total, 1), what, unit
-        self.began, self.tenth = time.monotonic(), 0
+    def tell(done: int) -> None:
+        if done * 10 // total > (done - 1) * 10 // total:
+            passed = time.monotonic() - began
+            left = in_time(passed / done * (total - done))
+            more = f", about {left} left" if passed > NEWS_S and done < total else ""
+            text = f"{what}: {done} of {total}{unit}{more}"
+            log.info("%s", text, extra={"news": bool(more)})
 
-    def tell(self, done: int) -> None:
-        """So many parts are done."""
-        if done * 10 // self.total <= self.tenth:
-            return
-        self.tenth = done * 10 // self.total
-        passed = time.monotonic() - self.began
-        left = passed / done * (self.total - done)
-        more = f", about {in_time(left)} left" if passed > NEWS_S and done < self.total else ""
-        text = f"{self.what}: {done} of {self.total}{self.unit}{more}"
-        log.info("%s", text, extra={"news": bool(more)})
+    return tell
 
 
 def progress(items: Iterable, total: int, what: str) -> Iterator:
     """Pass items through and log about every tenth part done."""
-    steps = _Progress(total, what)
+    tell = _teller(total, what)
     for done, item in enumerate(items, start=1):
         yield item
-        steps.tell(done)
+        tell(done)
 
 
 def block_progress(total: int, what: str, name: str = "") -> Any:
@@ -243,13 +233,13 @@ def block_progress(total: int, what: str, name: str = "") -> Any:
     tasks count whose key begins with ``name``."""
     from dask.callbacks import Callback  # most jobs do without Dask
 
-    done, steps = 0, _Progress(total, what, " blocks")
+    done, tell = 0, _teller(total, what, " blocks")
 
     def count(key: object, *_: object) -> None:
         nonlocal done
         if str(key).startswith(name):
             done += 1
-            steps.tell(done)
+            tell(done)
 
     return Callback(posttask=count)
 

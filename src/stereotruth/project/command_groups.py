@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -28,30 +29,20 @@ def examples(*lines: str) -> str:
     return "\n\n".join(["[bold]Examples[/bold]", *(f"[cyan]{line}[/cyan]" for line in lines)])
 
 
-def complete_targets(context: typer.Context) -> list[str]:
-    """For the shell: what may follow in `stereotruth run`; nothing where there is no project."""
+def complete(context: typer.Context) -> list[str]:
+    """For the shell: targets, profiles or cities, as the command wants; none without a project."""
     from .run_workflow import completions
 
+    of_profile = context.info_name == "profile"
     with suppress(InputError, OSError):
-        return completions(context.params.get("given") or [])
+        found = completions(["--profile"] if of_profile else context.params.get("given") or [])
+        if of_profile or context.info_name == "run":
+            return found
+        return [word.removeprefix("tiles/") for word in found if word.startswith("tiles/")]
     return []
 
 
-def complete_profiles(context: typer.Context) -> list[str]:
-    """For the shell: the profiles of the package."""
-    del context
-    from .run_workflow import completions
-
-    return completions(["--profile"])
-
-
-def complete_cities(context: typer.Context) -> list[str]:
-    """For the shell: cities of the project."""
-    return [
-        target.removeprefix("tiles/")
-        for target in complete_targets(context)
-        if target.startswith("tiles/")
-    ]
+named = partial(typer.Argument, autocompletion=complete)
 
 
 def print_lines(lines: Iterable[str]) -> None:

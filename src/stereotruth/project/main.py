@@ -16,11 +16,9 @@ from ..core.errors import InputError, told_by_system
 from .command_groups import (
     AllowedHosts,
     Configured,
-    complete_cities,
-    complete_profiles,
-    complete_targets,
     examples,
     gcps_app,
+    named,
     print_lines,
     scene_app,
 )
@@ -185,10 +183,7 @@ def lidar_tiles(
 )
 def check(
     scenes: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Scenes or cities; all if none is named.", autocompletion=complete_cities
-        ),
+        list[str] | None, named(help="Scenes or cities; all if none is named.")
     ] = None,
     configfile: Configured = None,
 ) -> None:
@@ -208,9 +203,7 @@ def check(
     )
 )
 def pairs(
-    city: Annotated[
-        str, typer.Argument(help="City of the images sheet.", autocompletion=complete_cities)
-    ],
+    city: Annotated[str, named(help="City of the images sheet.")],
     most: Annotated[int | None, typer.Option(min=1, help="Write the best so many.")] = None,
     convergence: Annotated[
         tuple[float, float], typer.Option(help="Write pairs from … to degrees of convergence.")
@@ -264,12 +257,7 @@ def pairs(
 def run(
     context: typer.Context,
     given: Annotated[
-        list[str] | None,
-        typer.Argument(
-            hidden=True,
-            metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]",
-            autocompletion=complete_targets,
-        ),
+        list[str] | None, named(hidden=True, metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]")
     ] = None,
 ) -> None:
     """Run the workflow; see ``help`` above."""
@@ -297,12 +285,7 @@ def targets(configfile: Configured = None) -> None:
     )
 )
 def profile(
-    name: Annotated[
-        str,
-        typer.Argument(
-            help="The profile; without one, list them.", autocompletion=complete_profiles
-        ),
-    ] = "",
+    name: Annotated[str, named(help="The profile; without one, list them.")] = "",
     folder: Annotated[
         Path | None, typer.Argument(help="Folder to be written; else the profile's name.")
     ] = None,
@@ -315,10 +298,7 @@ def profile(
 
 @app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))
 def status(
-    cities: Annotated[
-        list[str] | None,
-        typer.Argument(help="All if none is named.", autocompletion=complete_cities),
-    ] = None,
+    cities: Annotated[list[str] | None, named(help="All if none is named.")] = None,
     configfile: Configured = None,
 ) -> None:
     """Say what is made of each city, and what is out of date and why."""
@@ -329,8 +309,8 @@ def status(
 
 @app.command(epilog=examples("stereotruth compare results.before results"))
 def compare(
-    old: Annotated[Path, typer.Argument(help="Folder of results, or of a project.")],
-    new: Annotated[Path, typer.Argument(help="Another one, with the same scenes.")],
+    old: Annotated[Path, typer.Argument(help="A folder `results`.")],
+    new: Annotated[Path, typer.Argument(help="Another one, of the same scenes.")],
 ) -> None:
     """Say by scene how far labels have moved from OLD to NEW, and what control points say."""
     from .findings import wide

@@ -37,7 +37,6 @@ AFTER_TILES = {
     "evaluate_truth_city", "grid_truth", "report_city", "simulate_truth",
 }  # fmt: skip
 TO_DO = "a run of tiles, evaluate and report would do, and why"
-ALIGNMENTS = "adjust/{}/alignment.json", "refine/{}/alignment.json", "align/{}/alignment.json"
 # How Snakemake says that params differ, and what stands in these; ``code``, and what stands in
 # ``sources``, are digests (workflow/rules/sources.smk).
 PARAMS = re.compile(r"Params have changed .*?before: (.*) now: (.*)")
@@ -234,41 +233,31 @@ def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> No
     wide().print(table)
 
 
-def _results(folder: Path) -> Path:
-    """The results in a folder, or in a project's. Raises InputError if it has no labels."""
-    for place in (folder, folder / "results"):
-        if any(place.glob("project/*/*.zarr")):
-            return place
-    raise InputError(
-        "no labels in it (project/<City>/<scene>.zarr)",
-        file=folder,
-        remedy="name a folder `results`, or that of a project that has run",
-    )
-
-
 def compare(old: Path, new: Path) -> Table:
-    """A table of the scenes that two folders of results share: how far labels have moved from the
-    ``old`` to the ``new``, and the control points of both. Raises InputError if they share none."""
-    before, after = _results(old), _results(new)
-    headings = ("scene", "labels, px of disparity", "95 %, px", "control points, px rms", "worst")
+    """A table of the scenes of two folders `results`: how far labels have moved from the ``old`` to
+    the ``new``, and the control points of both. Raises InputError if they share no scene."""
+    headings = ("scene", "labels, px of disparity", "control points, px rms", "worst")
     table = plain_table(headings, whole=("scene",))
-    for store in sorted(after.glob("project/*/*.zarr")):
-        if not (before / store.relative_to(after)).is_dir():
-            continue
-        found = moves(sample_labels(before / store.relative_to(after)), store)
-        name = f"{store.parent.name}/{store.stem}"
-        records = [_alignment(results, name) for results in (before, after)]
-        rms = " -> ".join(map(_rms, records))
-        cells = str(found or "none before"), f"{found.p95_px:.3f}" if found else ""
-        table.add_row(*map(escape, (name, *cells, rms, str(worst_point(records[1]) or ""))))
+    for store in sorted(new.glob("project/*/*.zarr")):
+        if (before := old / store.relative_to(new)).is_dir():
+            found = moves(sample_labels(before), store)
+            name = f"{store.parent.name}/{store.stem}"
+            records = [_alignment(results, name) for results in (old, new)]
+            rms = " -> ".join(map(_rms, records))
+            cells = name, str(found or "none before"), rms, worst_point(records[1])[1]
+            table.add_row(*map(escape, cells))
     if not table.row_count:
-        raise InputError("no scene that both have", file=new, remedy=f"compare it with {old}'s own")
+        raise InputError(
+            f"no labels (project/<City>/<scene>.zarr) of a scene that {old} has, too",
+            file=new,
+            remedy="name the folders `results` of two runs",
+        )
     return table
 
 
 def _alignment(results: Path, scene: str) -> Mapping[str, Any]:
     """The last record of a scene's alignment; empty without any."""
-    files = (results / name.format(scene) for name in ALIGNMENTS)
+    files = (results / stage / scene / "alignment.json" for stage in ("adjust", "refine", "align"))
     return next((read_json(file) for file in files if file.is_file()), {})
 
 

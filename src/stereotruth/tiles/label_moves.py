@@ -55,12 +55,11 @@ def sample_labels(store: str | Path) -> Floats:
 
 @dataclass(frozen=True)
 class Moves:
-    """How far ``count`` labels have moved, px of disparity: ``median_px``, ``p95_px``, ``most_px``;
-    NaN if none is left. ``gone_share``: of the labels before, those that are no more."""
+    """How far ``count`` labels have moved, px of disparity: ``median_px``, ``most_px``; NaN if none
+    is left. ``gone_share``: of the labels before, those that are no more."""
 
     count: int
     median_px: float
-    p95_px: float
     most_px: float
     gone_share: float
 
@@ -85,8 +84,8 @@ def moves(before: Floats, store: str | Path) -> Moves | None:
     x_right, _ = model.right_to_epipolar(*before[:, 2:].T)
     moved = np.abs(_between(disparity, x, y) - (x - x_right))
     left = moved[np.isfinite(moved)]
-    figures = np.percentile(left, (50, 95, 100)) if left.size else np.full(3, np.nan)
-    return Moves(left.size, *map(float, figures), 1.0 - left.size / len(moved))
+    figures = (float(np.median(left)), float(left.max())) if left.size else (math.nan, math.nan)
+    return Moves(left.size, *figures, 1.0 - left.size / len(moved))
 
 
 def _between(disparity: Any, x: Floats, y: Floats) -> Floats:
@@ -129,40 +128,28 @@ def keep_samples(stores: Mapping[str, str | Path]) -> None:
             np.save(stream, sample_labels(store))
 
 
-@dataclass(frozen=True)
-class WorstPoint:
-    """The control point ``id`` of a ``view`` that the others predict worst: its ``residual_px``
-    after the fit, and without it in the fit ``times`` the median of the view's points."""
-
-    id: str
-    view: str
-    residual_px: float
-    times: float
-
-    def __str__(self) -> str:
-        return (
-            f"worst control point {self.id} ({self.view} image): {self.residual_px:.2f} px; "
-            f"left out of the fit, {self.times:.1f} times the median of all"
-        )
-
-
-def worst_point(alignment: Mapping[str, Any]) -> WorstPoint | None:
-    """Of the points that a record ``alignment.json`` uses; None where there are too few to tell."""
-    found = []
+def worst_point(alignment: Mapping[str, Any]) -> tuple[float, str]:
+    """The control point of a record ``alignment.json`` that the others predict worst: its residual
+    without it in the fit, over the median of its image's points; its name and figures in words,
+    empty where there are too few points to tell."""
+    found = [(0.0, "")]
     for view in ("left", "right"):
         points = [p for p in alignment.get(view, {}).get("gcps", []) if p.get("used", True)]
         points = [p for p in points if None not in p.get("leave_one_out", [None])]
-        lengths = [math.hypot(*p["leave_one_out"]) for p in points]
-        if lengths and (median := float(np.median(lengths))) > 0:
-            times, k = max((length / median, k) for k, length in enumerate(lengths))
-            found.append(WorstPoint(points[k]["id"], view, math.hypot(*points[k]["after"]), times))
-    return max(found, key=lambda point: point.times, default=None)
+        lengths = [math.hypot(*point["leave_one_out"]) for point in points]
+        for point, length in zip(points, lengths):
+            if median := float(np.median(lengths)):
+                text = f"worst control point {point['id']} ({view} image): "
+                text += f"{math.hypot(*point['after']):.2f} px; left out of the fit, "
+                text += f"{length / median:.1f} times the median of all"
+                found.append((length / median, text))
+    return max(found)
 
 
 def edit_lines(moved: Mapping[str, Moves], alignments: Iterable[Mapping[str, Any]]) -> list[str]:
     """For the end of a run: since the last one, and the worst control point of each scene."""
-    points = [(record.get("scene", ""), worst_point(record)) for record in alignments]
+    points = [(record.get("scene", ""), worst_point(record)[1]) for record in alignments]
     return [
         *(f"Since the last run, {scene}: {found}" for scene, found in moved.items()),
-        *(f"{scene}: {point}" for scene, point in points if point is not None),
+        *(f"{scene}: {point}" for scene, point in points if point),
     ]

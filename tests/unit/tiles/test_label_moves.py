@@ -94,9 +94,8 @@ def test_the_worst_control_point_is_the_one_that_the_others_predict_worst():
         "left": {"gcps": [*good, point("left out", 9.0, 9.0, used=False)]},
         "right": {"gcps": [*good, point("7", 0.25, 0.6)]},
     }
-    worst = worst_point(record)
-    assert (worst.id, worst.view, worst.residual_px) == ("7", "right", 0.25)
-    assert worst.times == pytest.approx(6.0)
-    (line,) = edit_lines({}, [record])
-    assert "A-1" in line and "7" in line and "0.25 px" in line
-    assert worst_point({"left": {"gcps": [{"id": "1", "after": [0, 0]}]}}) is None
+    times, text = worst_point(record)
+    assert times == pytest.approx(6.0) and edit_lines({}, [record]) == [f"A-1: {text}"]
+    assert all(part in text for part in ("7 (right", "0.25 px", "6.0 times"))
+    assert worst_point({"left": {"gcps": [{"id": "1", "after": [0, 0]}]}}) == (0.0, "")
+    assert edit_lines({}, [{}]) == []

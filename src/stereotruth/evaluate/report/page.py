@@ -132,6 +132,7 @@ def write_report(
     )
     sizes = _pixel_sizes(folder, labelled)
     height = max((size.height_m for size in sizes.values()), default=None)
+    since = {"since_last_run": _record(files.summary).get("since_last_run", {})}
     truth_rows = _rows(files.truth_table)
     figure_count = 2 + len(files.looks) + 2 * len(alignments)
     allowed = _allowance("figures", figure_count)
@@ -151,14 +152,7 @@ def write_report(
     values = {
         "city": city,
         "index": way(out, index),
-        "headlines": headlines(
-            rows,
-            alignments,
-            refined,
-            truth_rows,
-            export | {"since_last_run": _record(files.summary).get("since_last_run", {})},
-            height,
-        ),
+        "headlines": headlines(rows, alignments, refined, truth_rows, export | since, height),
         "sizes": sizes,
         "height_m_per_px": height,
         "links": files.links(out),
@@ -243,10 +237,7 @@ def _of_tiles(
         "disparities": limits and Scale.of(DISPARITIES, *(minus(f"{v:.0f} px") for v in limits)),
         "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
         "statuses": _shares(every),
-        "status_colours": {
-            MISFIT: Status.CHANGED.colour,
-            **status_colours([name for name in every if name != MISFIT]),
-        },
+        "status_colours": status_colours(list(every)) | {MISFIT: Status.CHANGED.colour},
         "shares": {tile: _shares(counts) for tile, counts in statuses.items()},
         "split_colours": SPLIT_COLOURS,
         "no_match": f"rgb{NO_MATCH}",
@@ -302,16 +293,9 @@ def _pixel_sizes(folder: Path, labelled: Sequence[Row]) -> dict[str, PixelSize]:
 
 def status_counts(row: Row) -> Counter[str]:
     """Pixels of a tile by status; what is `changed` where nothing tells of a change, as MISFIT."""
-    counts = Counter(
-        {
-            name.removeprefix("count_"): int(value)
-            for name, value in row.items()
-            if name.startswith("count_") and value
-        }
-    )
-    if CHANGED in counts and not tells_of_change(row):
-        counts[MISFIT] = counts.pop(CHANGED)
-    return counts
+    told, start = tells_of_change(row), "count_"
+    counts = ((n.removeprefix(start), v) for n, v in row.items() if n.startswith(start) and v)
+    return Counter({MISFIT if n == CHANGED and not told else n: int(v) for n, v in counts})
 
 
 def _shares(counts: Counter[str]) -> dict[str, float]:

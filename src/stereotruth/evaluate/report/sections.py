@@ -108,8 +108,8 @@ def _moved(scenes: Mapping[str, Any]) -> list[Headline]:
     if not moved:
         return []
     text = f"{spread([of.median_px for of in moved.values()], '.3f')} px"
-    note = "; ".join(f"{scene}: {of}" for scene, of in moved.items())
-    return [Headline("moved since the last run", text, f"median; {note}")]
+    notes = [f"{scene}: {of}" if len(moved) > 1 else str(of) for scene, of in moved.items()]
+    return [Headline("moved since the last run", text, "; ".join(notes))]
 
 
 def _uncertainty(
@@ -254,11 +254,8 @@ def _gcps(alignments: Records, refined: Records) -> Headline:
     note = f"{rms(alignments, 'before')} px before"
     if refined:
         note += f", {rms(refined, 'after')} px after refinement"
-    points = {scene: worst_point(record) for scene, record in (alignments | refined).items()}
-    told = {scene: point for scene, point in points.items() if point is not None}
-    if told:
-        scene, point = max(told.items(), key=lambda item: item[1].times)
-        note = joined(note, f"{scene}: {point}" if alignments.keys() - {scene} else str(point))
+    (_, worst), scene = max((worst_point(of), name) for name, of in (alignments | refined).items())
+    note = joined(note, worst and (f"{scene}: {worst}" if len(alignments) > 1 else worst))
     return Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note)
 
 
