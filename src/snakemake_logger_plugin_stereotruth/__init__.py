@@ -55,6 +55,9 @@ class LogHandler(LogHandlerBase):
         elif event == LogEvent.JOB_ERROR:
             self._failed_job(record)
         elif record.levelno >= logging.WARNING and record.getMessage().strip():
+            of_job = getattr(record, "exception", "") == "RuleException" or self.failed
+            if of_job and record.levelno >= logging.ERROR:
+                return  # Snakemake's words for a job that has failed, which has told why
             self.failed = self.failed or record.levelno >= logging.ERROR
             self._say(record.getMessage())
 
@@ -104,8 +107,9 @@ class LogHandler(LogHandlerBase):
         self.failed = True
         if not any(failure_file(log).exists() for log in record.log):
             logs = ", ".join(map(str, record.log)) or "no log"
+            begun, _ = self.jobs.get(record.jobid, (record, 0.0))
             self._say(
-                f"Failed: {_name(record)}, and does not say why, as a job that is killed for its "
+                f"Failed: {_name(begun)}, and does not say why, as a job that is killed for its "
                 f"memory or its time. Look at {logs}"
             )
 
