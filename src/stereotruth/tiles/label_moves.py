@@ -90,20 +90,17 @@ def moves(before: Floats, store: str | Path) -> Moves | None:
 
 def _between(disparity: Any, x: Floats, y: Floats) -> Floats:
     """Bilinear values at places (px) of a stored grid; NaN where a pixel that counts has none."""
-    places = [np.where(np.abs(v - np.rint(v)) < ON_GRID_PX, np.rint(v), v) for v in (x, y)]
-    total = np.zeros(len(x))
-    inside = np.ones(len(x), np.bool_)
-    col, row = (np.floor(v).astype(int) for v in places)
-    fx, fy = (v - np.floor(v) for v in places)
-    for j, wx in ((0, 1 - fx), (1, fx)):
-        for i, wy in ((0, 1 - fy), (1, fy)):
-            weight = wx * wy
-            ok = (row + i >= 0) & (col + j >= 0)
-            ok &= (row + i < disparity.shape[0]) & (col + j < disparity.shape[1])
-            inside &= ok | (weight == 0)
-            ok &= weight > 0
-            total[ok] += weight[ok] * disparity.vindex[row[ok] + i, col[ok] + j]
-    return np.where(inside, total, np.nan)
+    place = np.stack([x, y])
+    place = np.where(np.abs(place - np.rint(place)) < ON_GRID_PX, np.rint(place), place)
+    first = np.floor(place).astype(int)
+    beside = np.array([[0, 1, 0, 1], [0, 0, 1, 1]])[..., None]  # (x, y) of four pixels
+    at, part = first[:, None] + beside, (place - first)[:, None]
+    weight = np.where(beside == 1, part, 1.0 - part).prod(axis=0)
+    values = np.where(weight > 0.0, np.nan, 0.0)
+    size = np.array(disparity.shape[::-1])[:, None, None]
+    read = ((at >= 0) & (at < size)).all(axis=0) & (weight > 0.0)
+    values[read] = disparity.vindex[at[1][read], at[0][read]]  # each chunk once
+    return (weight * values).sum(axis=0)
 
 
 def since_last_run(stores: Mapping[str, str | Path]) -> dict[str, Moves]:
