@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import logging
 import sys
+from collections.abc import Iterable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -13,15 +15,8 @@ import typer
 
 from .. import __version__
 from ..core.errors import InputError, told_by_system
-from .command_groups import (
-    AllowedHosts,
-    Configured,
-    examples,
-    gcps_app,
-    named,
-    print_lines,
-    scene_app,
-)
+from .judge import app as judge_app
+from .judge import examples
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
@@ -40,8 +35,39 @@ app = typer.Typer(
     help="Satellite pairs, LiDAR and ground control points to epipolar pairs with ground-truth "
     "disparity. Commands work in the folder of a project, where config.yaml lies.",
 )
+scene_app = typer.Typer(no_args_is_help=True, help="The scenes of the project.")
+gcps_app = typer.Typer(no_args_is_help=True, help="Ground control points.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(gcps_app, name="gcps")
+Configured = Annotated[
+    list[Path] | None,
+    typer.Option("--configfile", help="Read this instead of config.yaml; may be given again."),
+]
+AllowedHosts = Annotated[
+    list[str] | None,
+    typer.Option(help="Another host of which the catalogue may name tiles; may be given again."),
+]
+
+
+def complete(context: typer.Context) -> list[str]:
+    """For the shell: targets, profiles or cities, as the command wants; none without a project."""
+    from .run_workflow import completions
+
+    of_profile = context.info_name == "profile"
+    with suppress(InputError, OSError):
+        found = completions(["--profile"] if of_profile else context.params.get("given") or [])
+        if of_profile or context.info_name == "run":
+            return found
+        return [word.removeprefix("tiles/") for word in found if word.startswith("tiles/")]
+    return []
+
+
+named = partial(typer.Argument, autocompletion=complete)
+
+
+def _print(lines: Iterable[str]) -> None:
+    for line in lines:
+        typer.echo(line)
 
 
 def _version(wanted: bool) -> None:
@@ -138,6 +164,107 @@ def init(
     typer.echo(f"{to}: a project. Next: {go}{next_step}")
 
 
+@scene_app.command(
+    "add",
+    epilog=examples(
+        "stereotruth scene add /data/GF7_DLC_E115.4_N30.2 --lidar /data/lidar --city Qichun",
+        "stereotruth scene add left.tif right.tif --lidar lidar --gcps gcps.csv --city Marseille",
+        "stereotruth scene add delivery --lidar lidar --lidar-crs EPSG:2154+5720 --geoid RAF20.tif",
+    ),
+)
+def scene_add(
+    delivery: Annotated[
+        list[Path], typer.Argument(help="Folder of the delivery, or left and right image.")
+    ],
+    lidar: Annotated[
+        str,
+        typer.Option(
+            help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights; or a catalogue."
+        ),
+    ],
+    gcps: Annotated[str, typer.Option(help="CSV of ground control points, if any.")] = "",
+    city: Annotated[str, typer.Option(help="City; default: the delivery's name.")] = "",
+    scene: Annotated[str, typer.Option("--name", help="Name of the scene; default: City-1 …")] = "",
+    lidar_crs: Annotated[str, typer.Option(help="CRS of LiDAR files without one.")] = "",
+    geoid: Annotated[str, typer.Option(help="Geoid grid of orthometric heights.")] = "",
+    allow_host: AllowedHosts = None,
+    configfile: Configured = None,
+) -> None:
+    """Find images, RPCs and views in a delivery, look at the LiDAR, and write the scene's row."""
+    from .add_scene import add_scene
+
+    _print(
+        add_scene(
+            delivery,
+            lidar=lidar,
+            gcps=gcps,
+            city=city,
+            name=scene,
+            lidar_crs=lidar_crs,
+            geoid=geoid,
+            hosts=allow_host or (),
+            configfiles=configfile,
+        )
+    )
+
+
+@scene_app.command("list", epilog=examples("stereotruth scene list"))
+def scene_list(configfile: Configured = None) -> None:
+    """The scenes of the project: city, images and LiDAR of each."""
+    from .add_scene import list_scenes
+
+    _print(list_scenes(configfile))
+
+
+@scene_app.command("remove", epilog=examples("stereotruth scene remove Marseille-1"))
+def scene_remove(
+    scene: Annotated[str, typer.Argument(help="Name of the scene.")],
+    configfile: Configured = None,
+) -> None:
+    """Take a scene's row out of the scenes sheet; what was made of it stays."""
+    from .add_scene import remove_scene
+
+    typer.echo(remove_scene(scene, configfile))
+
+
+@gcps_app.command(
+    "import",
+    epilog=examples(
+        "stereotruth gcps import left.points right.points --heights heights.csv --to gcps/A-1.csv",
+        "stereotruth gcps import left.points right.points --heights dsm.tif --to gcps/A-1.csv",
+        "stereotruth gcps import points.gcp --left left.tif --right right.tif --to gcps/A-1.csv",
+        "stereotruth gcps import survey.csv --crs EPSG:32650 --to gcps/A-1.csv",
+    ),
+)
+def gcps_import(
+    files: Annotated[
+        list[Path], typer.Argument(help="Two .points (left, right), one .gcp, or one .csv.")
+    ],
+    to: Annotated[Path, typer.Option(help="The CSV to be written.")],
+    heights: Annotated[
+        Path | None,
+        typer.Option(help="For .points: CSV (id or lon,lat; height) or a raster of heights."),
+    ] = None,
+    crs: Annotated[str, typer.Option(help="CRS of a file that declares none.")] = "",
+    geoid: Annotated[
+        Path | None, typer.Option(help="Geoid grid, if the heights are orthometric.")
+    ] = None,
+    left: Annotated[str, typer.Option(help="Name of the left image in a .gcp file.")] = "",
+    right: Annotated[str, typer.Option(help="Name of the right image in a .gcp file.")] = "",
+    epoch: Annotated[
+        str, typer.Option(help="Epoch of the coordinates, 2016.4 or a date; empty: of the images.")
+    ] = "",
+) -> None:
+    """Bring control points of QGIS, Ames Stereo Pipeline or a CSV into the project's form."""
+    from .import_gcps import import_gcps
+
+    _print(
+        import_gcps(
+            files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right, epoch=epoch
+        )
+    )
+
+
 @app.command(
     "lidar",
     epilog=examples(
@@ -163,7 +290,7 @@ def lidar_tiles(
     """List the tiles of a catalogue that lie on the ground of scenes; rows then name the list."""
     from .list_tiles import list_of_scenes
 
-    print_lines(
+    _print(
         list_of_scenes(
             catalogue,
             to,
@@ -212,8 +339,7 @@ def pairs(
         tuple[float, float] | None, typer.Option(help="Write pairs from … to days apart.")
     ] = None,
     diachronic: Annotated[
-        bool,
-        typer.Option("--diachronic", help="Write pairs of two lights, by suns or over 30 days."),
+        bool, typer.Option("--diachronic", help="Write pairs of two lights.")
     ] = False,
     each: Annotated[
         int | None, typer.Option(min=1, help="Write at most so many pairs of each image.")
@@ -237,7 +363,7 @@ def pairs(
     given = {"lidar": lidar, "gcps": gcps, "lidar_crs": lidar_crs, "geoid": geoid}
     listing = list_pairs(city, choice, given, configfile)
     show_pairs(listing.rated, listing.chosen)
-    print_lines(listing.lines)
+    _print(listing.lines)
 
 
 @app.command(
@@ -274,7 +400,7 @@ def targets(configfile: Configured = None) -> None:
     """List what a run can make, one line each, and the names to put in."""
     from .run_workflow import list_targets
 
-    print_lines(list_targets(configfile))
+    _print(list_targets(configfile))
 
 
 @app.command(
@@ -293,7 +419,7 @@ def profile(
     """List the profiles of the package, or copy one here, to set account and partition in it."""
     from .new_project import copy_profile, list_profiles
 
-    print_lines([copy_profile(name, folder)] if name else list_profiles())
+    _print([copy_profile(name, folder)] if name else list_profiles())
 
 
 @app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))
@@ -307,61 +433,7 @@ def status(
     show_status(cities or [], configfile)
 
 
-@app.command(epilog=examples("stereotruth compare results.before results"))
-def compare(
-    old: Annotated[Path, typer.Argument(help="A folder `results`.")],
-    new: Annotated[Path, typer.Argument(help="Another one, of the same scenes.")],
-) -> None:
-    """Say by scene how far labels have moved from OLD to NEW, and what control points say."""
-    from .findings import wide
-    from .status import compare as table_of
-
-    wide().print(table_of(old, new))
-
-
-@app.command(
-    "score-dsm",
-    epilog=examples(
-        "stereotruth score-dsm dsm.tif --lidar /data/lidar --to verdict",
-        "stereotruth score-dsm dsm.tif --reference truth.tif --to verdict",
-        "stereotruth score-dsm dsm.tif --geoid egm08_25.gtx --lidar 'tiles/*.laz' --to verdict",
-    ),
-)
-def score_surface_model(
-    model: Annotated[Path, typer.Argument(help="GeoTIFF of heights, north-up, in metres.")],
-    to: Annotated[Path, typer.Option(help="Folder to be written: scores.json, index.html.")],
-    lidar: Annotated[
-        str, typer.Option(help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights.")
-    ] = "",
-    reference: Annotated[Path | None, typer.Option(help="Raster of true heights.")] = None,
-    geoid: Annotated[
-        Path | None, typer.Option(help="Geoid grid, if the model's heights are orthometric.")
-    ] = None,
-    lidar_crs: Annotated[str, typer.Option(help="For LiDAR files that declare none.")] = "",
-    reference_geoid: Annotated[
-        Path | None, typer.Option(help="Geoid grid, if the reference's heights are orthometric.")
-    ] = None,
-    reference_classes: Annotated[
-        Path | None, typer.Option(help="LAS classes on the grid of the reference raster.")
-    ] = None,
-    epoch: Annotated[str, typer.Option(help="Of the model's images, 2016.4 or a date.")] = "",
-) -> None:
-    """Judge any surface model: where it lies, its heights by surface and slope, edges of roofs."""
-    from .score_dsm import score_dsm
-
-    typer.echo(
-        score_dsm(
-            model,
-            to,
-            lidar=lidar,
-            reference=reference,
-            geoid=geoid,
-            lidar_crs=lidar_crs,
-            reference_geoid=reference_geoid,
-            reference_classes=reference_classes,
-            epoch=epoch,
-        )
-    )
+app.add_typer(judge_app)
 
 
 @app.command("open", epilog=examples("stereotruth open", "stereotruth open Marseille"))

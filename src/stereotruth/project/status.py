@@ -233,7 +233,7 @@ def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> No
     wide().print(table)
 
 
-def compare(old: Path, new: Path) -> Table:
+def compare_labels(old: Path, new: Path) -> Table:
     """A table of the scenes of two folders `results`: how far labels have moved from the ``old`` to
     the ``new``, and the control points of both. Raises InputError if they share no scene."""
     headings = ("scene", "labels, px of disparity", "control points, px rms", "worst")
