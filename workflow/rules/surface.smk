@@ -12,8 +12,6 @@ rule surface:
         "logs/surface/{city}/{scene}.log",
     benchmark:
         "logs/surface/{city}/{scene}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=4000,

@@ -208,12 +208,13 @@ class Dataset(Section):
     other scenes say that it is not known"""
 
     originals: Flag = False
-    """true: crops of the original images for each tile with corrected RPCs (tag and `_RPC.TXT`), in
-    `originals/<city>/`, for multi-view and neural reconstruction"""
+    """true: crops of the original images for each tile with corrected cameras (RPC, satnerf, EOGS,
+    COLMAP), in `originals/<city>/`, for multi-view and neural reconstruction"""
 
     original_heights: Flag = False
     """true: beside each crop in `originals/<city>/` the height of what each of its pixels shows,
-    with its standard uncertainty and status; of images that have a name in the images sheet"""
+    with its standard uncertainty, status and visibility in the other image; of images that have a
+    name in the images sheet"""
 
 
 class Evaluation(Section):
