@@ -45,12 +45,14 @@ def _file(nodeid: str) -> str:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Each file's tests by one process, in the order above: fixtures of a file are made once."""
+    """Each room's tests by one process, in the order above: what they share is made once, and
+    kernels are loaded once. Whole runs wait for each other: of these, each file's tests."""
     from xdist.scheduler import LoadScopeScheduling
 
-    class ByFile(LoadScopeScheduling):
+    class ByRoom(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return _file(nodeid)
+            file = PurePosixPath(_file(nodeid))
+            return str(file if file.parts[1] != "unit" else PurePosixPath(*file.parts[:3]))
 
     config.option.loadscopereorder = False  # by the number of tests
-    return ByFile(config, log)
+    return ByRoom(config, log)

@@ -128,17 +128,13 @@ def test_another_covariance_of_the_alignment_is_another_uncertainty(scene, tmp_p
 
 @pytest.mark.slow
 def test_strips_and_the_whole_give_the_same_bytes(scene, tmp_path):
-    for view in ("left", "right"):
-        whole = tmp_path / f"{view}.zarr"
-        everything = project(scene, [scene.store], whole, view=view)
-        out = tmp_path / f"{view}-strips.zarr"
-        parts = [
-            project(scene, [scene.store], out, view=view, strip=Strip(k, 3)) for k in (2, 0, 1)
-        ]
-        assert not out.exists()
-        assert set.union(*parts) == everything and sum(map(len, parts)) == len(everything)
-        assert project(scene, [scene.store], out, view=view) == set()
-        assert tree(out) == tree(whole)
+    whole, out = tmp_path / "whole.zarr", tmp_path / "strips.zarr"
+    everything = project(scene, [scene.store], whole, view="right")
+    parts = [project(scene, [scene.store], out, view="right", strip=Strip(k, 3)) for k in (2, 0, 1)]
+    assert not out.exists()
+    assert set.union(*parts) == everything and sum(map(len, parts)) == len(everything)
+    assert project(scene, [scene.store], out, view="right") == set()
+    assert tree(out) == tree(whole)
 
 
 @pytest.mark.slow

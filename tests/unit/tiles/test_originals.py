@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +19,7 @@ from stereotruth.tiles.originals import HEIGHTS, write_originals
 from stereotruth.tiles.verify import defects
 
 from ...synthetic.images import write
-from ...synthetic.tiled_scene import (
-    PIXELS,
-    SIZE,
-    camera,
-    make_scene,
-    rows_of,
-    run,
-    surface,
-    texture,
-)
+from ...synthetic.tiled_scene import PIXELS, SIZE, camera, rows_of, surface, texture
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 CAMERAS = {"left": camera(0.09, 0.02, 0.70), "right": camera(-0.48, -0.03, 0.75)}
@@ -36,9 +28,9 @@ META = {"units": "m", "long_name": "test"}
 
 
 @pytest.fixture(scope="module")
-def cropped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cropped(exported: tuple[Path, dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("originals")
-    run([make_scene(folder / "s1")], folder / "Town")
+    shutil.copytree(exported[0], folder / "Town")
     row, col = np.indices((PIXELS, PIXELS)).astype(float)
     for view, sensor in CAMERAS.items():
         lon, lat, _ = surface(sensor, col, row)
