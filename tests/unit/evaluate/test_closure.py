@@ -109,12 +109,11 @@ def shares(closures: np.ndarray, sigma: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("higher", [0.0, 0.5])
-def test_errors_that_all_pairs_share_close(tmp_path, higher):
+def test_errors_that_all_pairs_share_close(tmp_path):
     """Of an image's correction, and of the heights: they have no part in the uncertainty."""
     rpc = CAMERAS["B"].rpc
     moved = SensorModel(replace(rpc, samp_off=rpc.samp_off + 0.7, line_off=rpc.line_off - 0.4))
-    triplet = triplet_of(tmp_path, cameras=CAMERAS | {"B": moved}, higher=higher)
+    triplet = triplet_of(tmp_path, cameras=CAMERAS | {"B": moved}, higher=0.5)
     closures, sigma = closure_of_labels(triplet)
     assert np.sqrt(np.mean(closures**2)) < 0.003
     assert np.sqrt(np.mean(sigma**2)) < 0.003

@@ -275,7 +275,6 @@ def test_all_bytes_are_the_same_in_any_order(box, tmp_path, monkeypatch) -> None
         [
             (first, {"workers": 1}),
             (first[::-1], {"workers": 2}),
-            (second, {"workers": 2}),
             (second, {"scheduler": "sync"}),
         ]
     ):
