@@ -278,8 +278,13 @@ ASKED = {
     "score-dsm --reference": {"above EGM96, its grid given", "fill -9999, undeclared"},
     "gcps import --heights": {"above a geoid in feet", "depths"},
 }
+SLOW = pytest.mark.slow
 CASES = [
-    pytest.param(door, kind, id=f"{door}, {kind.name}")
+    pytest.param(
+        *(door, kind),
+        id=f"{door}, {kind.name}",
+        marks=[SLOW] * (door.startswith("score") and not kind.right),
+    )
     for door in DOORS
     for kind in KINDS
     if kind.name in ASKED[door]

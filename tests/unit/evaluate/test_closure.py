@@ -119,6 +119,7 @@ def test_errors_that_all_pairs_share_close(tmp_path):
     assert np.sqrt(np.mean(sigma**2)) < 0.003
 
 
+@pytest.mark.slow
 def test_the_uncertainty_explains_labels_that_differ_by_their_reading(tmp_path):
     """White noise of known size in each pair, and the same ground four times as rough."""
     for k, noise in enumerate((NOISE, 4 * NOISE)):

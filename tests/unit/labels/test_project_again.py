@@ -65,6 +65,7 @@ def project(scene: Scene, stores: list[Path], out: Path, **options) -> set[str]:
     }
 
 
+@pytest.mark.slow
 def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path):
     """And the bytes are those of a run from scratch with both files."""
     out = tmp_path / "out.zarr"

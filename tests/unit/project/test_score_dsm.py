@@ -28,6 +28,7 @@ def test_one_reference_is_needed(tmp_path):
 IN_ITRF = (-1.478, 0.322, -0.317)  # NAD83(2011) in ITRF2020 at 2020.0, by PROJ: east, north, up (m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "other", "option", "sign"),
     [(6339, 32610, "reference", 1), (32610, 6339, "lidar", -1)],

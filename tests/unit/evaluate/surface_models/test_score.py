@@ -111,6 +111,7 @@ def test_a_blur_shows_at_the_edges_and_hardly_elsewhere(judge, exact):
     assert abs(found["registration"]["east_m"]) < 0.05
 
 
+@pytest.mark.slow
 def test_lost_roofs_are_missing_edges_and_bare_trees_stand_apart(judge, exact):
     heights = Town().heights()  # as in winter
     half = heights.shape[1] // 2
