@@ -67,6 +67,7 @@ def test_points_elsewhere_change_no_label(stores, tmp_path):
     assert [grid.attrs["lidar"]["not_read_m2"] for grid in grids] == [0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_points_elsewhere_choose_no_places_for_tie_points(stores):
     model = surfaces_of(True)[0]
     whole, part, _ = ([PointStore(path)] for path in (*stores[:2], stores[1]))

@@ -82,6 +82,7 @@ def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path)
     assert tree(out) == tree(other)
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_carried_on(scene, tmp_path, monkeypatch):
     """What the LiDAR has decided is taken over; nothing of it is left in the end."""
     whole, out = tmp_path / "whole.zarr", tmp_path / "out.zarr"
