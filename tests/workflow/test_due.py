@@ -133,7 +133,7 @@ def test_a_copy_with_its_times_and_snakemakes_own_folder_is_at_rest(made, tmp_pa
 
 
 EDITS = ("in/gcps.csv", "in/lidar/1.laz", "mine.py")  # they and the seed reach most rules
-FAILS = ("kill", "refuse", "disk", "defect", "node")
+FAILS = ("kill", "refuse", "node")
 
 
 def test_jobs_that_fail_are_made_again_with_all_that_follows(made):
