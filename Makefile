@@ -21,7 +21,6 @@ CORES ?= 2
 BIN := .venv/bin
 READY := .venv/ready
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
-AT_ONCE := $(shell expr $(CORES) + 1)  # short tests: some wait for a server or a lock
 # Many processes run the same modules: each would compile anew what nobody may keep compiled.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -69,7 +68,7 @@ dataset verify: %: $(READY) FORCE
 	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --cores $(CORES) $@
 
 test: $(READY)
-	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(AT_ONCE) -m "not slow"
+	PATH="$(CURDIR)/$(BIN):$$PATH" pytest -n $(CORES) -m "not slow"
 
 test-all: test test-slow
 
@@ -88,17 +87,20 @@ test-networks: networks
 
 # Libraries of newer Pythons are newer, too: GDAL, PROJ, NumPy, zarr decide what files hold.
 OTHERS := 3.12 3.13
-FILE_TESTS := $(addprefix tests/unit/,core sensor epipolar lidar tiles)
+FILE_TESTS := $(addprefix tests/unit/,core/products core/test_tables.py sensor/test_images.py sensor/test_rpc_files.py \
+  epipolar/test_rectify.py lidar/test_ingest.py lidar/test_point_store.py lidar/test_las_files.py lidar/test_height_raster.py \
+  lidar/test_frames.py lidar/test_geoid.py lidar/test_to_wgs84.py tiles/test_tile_files.py tiles/test_layouts.py tiles/test_originals.py)
 # The interpreter of a version, on the PATH or pyenv's; empty where there is none.
 interpreter = $(firstword $(shell python$(1) -c "import sys; print(sys.executable)" 2> /dev/null) $(wildcard $(HOME)/.pyenv/versions/$(1).*/bin/python))
 
-test-pythons: $(foreach version,$(OTHERS),$(if $(call interpreter,$(version)),test-python$(version),no-python$(version)))
+test-pythons:
+	$(MAKE) --no-print-directory -j $(CORES) --output-sync $(foreach version,$(OTHERS),$(if $(call interpreter,$(version)),test-python$(version),no-python$(version)))
 
 no-python%:
 	@echo "SKIPPED: the tests on Python $*, which this machine does not have"
 
 test-python%: .venv-%/ready
-	PATH="$(CURDIR)/.venv-$*/bin:$$PATH" pytest -n $(AT_ONCE) -m "not slow" $(FILE_TESTS)
+	PATH="$(CURDIR)/.venv-$*/bin:$$PATH" pytest -m "not slow" $(FILE_TESTS)
 
 .PRECIOUS: .venv-%/ready  # made by way of test-python%: make would remove it
 .venv-%/ready: $(READY)

@@ -16,6 +16,7 @@ for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_N
 # Test files that processes begin with: the first makes the city of the workflow's tests and all
 # that follows from it, which the others wait for; the next ones need nothing of it.
 FIRST = ("test_audit", "test_plans", "test_job_start")
+LONGEST = ("labels", "tiles", "align", "lidar")  # rooms, before those that take less
 
 
 def pytest_collection_modifyitems(items):
@@ -27,7 +28,7 @@ def pytest_collection_modifyitems(items):
     def place(item: pytest.Item) -> int:
         file = PurePosixPath(_file(item.nodeid))
         if file.parent.name != "workflow":
-            return len(FIRST) + 2
+            return len(FIRST) + 2 + LONGEST.index(room) if (room := _room(file)) in LONGEST else 99
         if file.stem in FIRST:
             return FIRST.index(file.stem)
         return len(FIRST) + (str(file) in waiting)
@@ -43,14 +44,21 @@ def _file(nodeid: str) -> str:
     return nodeid.partition("::")[0]
 
 
+def _room(file: PurePosixPath) -> str:
+    """The room whose unit tests a file has; empty if it has none."""
+    return file.parts[2] if file.parts[1] == "unit" and len(file.parts) > 3 else ""
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Each file's tests by one process, in the order above: fixtures of a file are made once."""
+    """Each room's tests by one process, in the order above: what they share is made once, and
+    kernels are loaded once. Whole runs wait for each other: of these, each file's tests."""
     from xdist.scheduler import LoadScopeScheduling
 
-    class ByFile(LoadScopeScheduling):
+    class ByRoom(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return _file(nodeid)
+            file = PurePosixPath(_file(nodeid))
+            return _room(file) or str(file)
 
     config.option.loadscopereorder = False  # by the number of tests
-    return ByFile(config, log)
+    return ByRoom(config, log)

@@ -125,14 +125,6 @@ def _lidar(**options: object) -> Callable[[Path], object]:
     return lambda folder: write_lidar(folder, **options)
 
 
-def _named(name: str, **options: object) -> Callable[[Path], object]:
-    def plant(folder: Path) -> None:
-        (folder / "lidar" / "points.laz").unlink()
-        write_lidar(folder, name, **options)
-
-    return plant
-
-
 def _replaced(file: str, old: str, new: str) -> Callable[[Path], object]:
     def plant(folder: Path) -> None:
         text = (folder / file).read_text()
@@ -185,36 +177,15 @@ def _blunders(rows: list[dict]) -> None:
         row["left_row"] -= rng.uniform(40, 200)
 
 
-def _on_a_line(rows: list[dict]) -> list[dict]:
-    from stereotruth.sensor.rpc import SensorModel
-
-    for k, row in enumerate(rows):
-        row["lon"], row["lat"] = LON - 0.008 + 0.001 * k, LAT
-        for view in ("left", "right"):
-            place = SensorModel(RPCS[view]).project(row["lon"], row["lat"], row["height"])
-            row[f"{view}_col"], row[f"{view}_row"] = map(float, place)
-    return rows
-
-
 COMPOUND = pyproj.CRS("EPSG:32650+5773")
-ZONE_51, SOUTH = pyproj.CRS("EPSG:32651").to_3d(), pyproj.CRS("EPSG:32750").to_3d()
+ZONE_51 = pyproj.CRS("EPSG:32651").to_3d()
+# One of each kind: what readers and stages refuse besides, their own tests have.
 FAULTS = [
-    Fault("unknown key", "unknown key 'tile'", lambda f: write_settings(f, tile=1)),
     Fault("value out of range", "tiles.size", lambda f: write_settings(f, tiles={"size": 4})),
-    Fault("no YAML", "cannot be read as YAML", lambda f: (f / "config.yaml").write_text("a: [")),
-    Fault(
-        "stride",
-        "share no common step",
-        lambda f: write_settings(f, tiles={"size": 1024, "stride": 1023, "min_labelled": 0}),
-    ),
     Fault("column", "column 'lidar_crs' is missing", _replaced("scenes.tsv", "lidar_crs", "crs")),
-    Fault("unknown city", "not in cities.tsv", lambda f: write_sheet(f, city="God")),
-    Fault("one image twice", "one image twice", lambda f: write_sheet(f, right_image="left.tif")),
     Fault("no scene", "no scene in it",
           lambda f: (f / "scenes.tsv").write_text("\t".join(SHEET_COLUMNS))),
     Fault("no left image", "left_image", _without("left.tif")),
-    Fault("no GCP file", "does not exist", _without("gcps.csv")),
-    Fault("no LiDAR", "no LiDAR file", _without("lidar/points.laz")),
     Fault(
         "no GCPs, no refinement",
         "alignment.refine is false",
@@ -225,14 +196,10 @@ FAULTS = [
         lambda f: write_settings(f, alignment={"fixed": {"Good-1": "none.json"}}),
     ),
     Fault("image cut short", "left.tif", _cut("left.tif", 0.3)),
-    Fault("no image", "left.tif", lambda f: (f / "left.tif").write_text("<html>404</html>")),
-    Fault("complex image", "complex image", _pixels("complex64", compress="deflate")),
     Fault("damaged block", "is damaged", _flipped),
     Fault("nothing but nodata", "no pixel but nodata",
           lambda f: write_image(f / "left.tif", RPCS["left"], SIZES["left"])),
     Fault("map-projected", "map grid and has an RPC", on_grid),
-    Fault("no RPC", "no RPC metadata",
-          lambda f: (_pixels("uint8")(f), (f / "left.rpb").unlink())),
     Fault("RPC cut short", "malformed RPC", lambda f: (_rpb("left")(f), _cut("left.rpb")(f))),
     Fault("RPC of other ground", "the other image and the GCPs are elsewhere",
           _rpb("right", long_off=LON + 6)),
@@ -242,52 +209,20 @@ FAULTS = [
                      write_sheet(f, gcps=""))),
     Fault("GCP column", "column 'left_row' is missing",
           _replaced("gcps.csv", "left_row", "leftrow")),
-    Fault("GCPs separated by semicolons", "separated by commas",
-          _replaced("gcps.csv", ",", ";")),
-    Fault("GCP no number", "is no number", _gcps(lambda rows: rows[3].update(lon="12°3"))),
-    Fault("GCP twice", "both have the id", _gcps(lambda rows: rows[3].update(id="G01"))),
-    Fault("GCPs swapped lon and lat", "swapped",
-          _gcps(_each(lon=lambda r: r["lat"], lat=lambda r: r["lon"]))),
     Fault("GCPs elsewhere", "far from the ground", _gcps(_each(lon=lambda r: r["lon"] + 3))),
-    Fault("GCPs projected", "no degrees", _gcps(_each(lon=lambda r: 5e5, lat=lambda r: 3.3e6))),
-    Fault("GCP heights in mm", "not of this Earth",
-          _gcps(_each(height=lambda r: 1e3 * r["height"]))),
-    Fault("two GCPs", "needs 4", _gcps(lambda rows: rows[:2])),
-    Fault("GCPs on a line", "along one line", _gcps(_on_a_line)),
-    Fault("GCP outside the image", "outside the left image",
-          _gcps(lambda rows: rows[2].update(left_col=9000.0))),
-    Fault("images exchanged", "seem to be swapped",
-          lambda f: write_sheet(f, left_image="right.tif", right_image="left.tif")),
-    Fault("columns and rows exchanged", "left image",
-          _gcps(_each(left_col=lambda r: r["left_row"], left_row=lambda r: r["left_col"]))),
     Fault("GCPs contradict each other", "do not fit the image", _gcps(_blunders)),
     Fault("no CRS", "no coordinate reference system", _lidar(system=None)),
-    Fault("lidar_crs", "cannot be used",
-          lambda f: (write_lidar(f, system=None), write_sheet(f, lidar_crs="EPSG:99999"))),
     Fault("LAZ cut short", "truncated", _cut("lidar/points.laz", 0.7)),
-    Fault("LAS cut short", "truncated",
-          lambda f: (_named("points.las")(f), _cut("lidar/points.las", 0.7)(f))),
-    Fault("no LAS", "no readable LAS", lambda f: (f / "lidar/points.laz").write_text("404")),
     Fault("LiDAR of the next zone", "degrees away", _lidar(system=ZONE_51)),
-    Fault("LiDAR of the other hemisphere", "Remedy", _lidar(system=SOUTH)),
     Fault("LiDAR of other ground", "no overlap", _lidar(lat=LAT + 0.2)),
-    Fault("LiDAR six degrees away", "degrees away", _lidar(lon=LON + 6, system=UTM)),
     Fault("swapped lon and lat", "Remedy",
           lambda f: write_las(f / "lidar/points.laz", 2000, scale=1e-7, system=pyproj.CRS(4979),
                               xyz=np.random.default_rng(1).uniform(
                                   (LAT - 0.01, LON - 0.01, 30), (LAT + 0.01, LON + 0.01, 99),
                                   (2000, 3)))),
-    Fault("degrees as metres", "look like degrees",
-          lambda f: write_las(f / "lidar/points.laz", 2000, scale=1e-7, system=UTM,
-                              xyz=np.random.default_rng(1).uniform(
-                                  (LON - 0.01, LAT - 0.01, 30), (LON + 0.01, LAT + 0.01, 99),
-                                  (2000, 3)))),
     Fault("orthometric heights", "orthometric", _lidar(system=COMPOUND)),
-    Fault("datum in the name", "declares no vertical datum",
-          _named("tile_IGN69.laz", system=pyproj.CRS(32650))),
     Fault("geoid elsewhere", "outside the geoid grid",
           lambda f: (write_lidar(f, system=COMPOUND), _geoid(f))),
-    Fault("coarse steps", "stored in steps", _lidar(scale=2.0)),
     Fault("tile too large", "not one tile of",
           lambda f: write_settings(f, tiles={"size": 4096, "min_labelled": 0})),
     Fault("too few points", "min_labelled asks",

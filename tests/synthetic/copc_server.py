@@ -152,7 +152,6 @@ def _status(status: int, **headers: str) -> Callable[[Server], tuple[int, dict[s
 SERVER_FAULTS: dict[str, tuple[bool, Callable[[Server], tuple[int, dict[str, str]]] | None]] = {
     "429 with seconds": (True, _status(429, Retry_After="1")),
     "429 with a date": (True, lambda s: (429, {"Retry-After": formatdate(time.time() + 1)})),
-    "503": (True, _status(503)),
     "redirect to itself once": (True, lambda s: (302, {"Location": s.url})),
     "reset": (True, None),
     "short body": (True, None),
@@ -168,7 +167,6 @@ SERVER_FAULTS: dict[str, tuple[bool, Callable[[Server], tuple[int, dict[str, str
     "redirect to another host": (False, lambda s: (302, {"Location": s.target})),
     "redirect to another port": (False, _status(302, Location="http://127.0.0.1:9/x?sig=secret")),
     "drip": (False, None),
-    "drip of the head": (False, None),
     "no ranges": (False, None),
     "encoded": (False, None),
     "replaced: size": (False, None),
@@ -232,11 +230,9 @@ class Answer(BaseHTTPRequestHandler):
             content = file.read_bytes()
         if fault and (status := SERVER_FAULTS[fault][1]):
             return self.send(*status(self.state))
-        if fault in ("reset", "drip of the head"):
+        if fault == "reset":
             self.close_connection = True
-            return (
-                self.drip(b"HTTP/1.1 206 Partial Content\r\nX-Long: ") if "drip" in fault else None
-            )
+            return None
         if fault == "stall":
             time.sleep(1.0)
         tag = '"two"' if fault == "replaced: ETag" else '"one"'

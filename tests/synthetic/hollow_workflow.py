@@ -8,7 +8,6 @@ fail in one of :data:`WAYS`.
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -28,9 +27,9 @@ from stereotruth.core.products.making import checksum, making
 from .forked_snakemake import RUN, runner, start_snakemake
 from .project import Project, copy_project, row_of
 
-# A job is killed, refuses, finds the disk full, has a defect; Snakemake is killed with it, or
-# without it, so that it goes on later; its input is edited while it works, for good or for a while.
-WAYS = ("kill", "refuse", "disk", "defect", "node", "orphan", "edit", "revert")
+# A job is killed, or refuses; Snakemake is killed with it, or without it, so that it goes on later;
+# its input is edited while it works, for good or for a while.
+WAYS = ("kill", "refuse", "node", "orphan", "edit", "revert")
 FAULT, STRUCK, GO_ON = Path("fault.json"), Path("fault.struck"), Path("go.on")
 SUFFIXES = {".json", ".csv", ".png", ".npz", ".tif", ".laz", ".html", ".md", ".pt", ".tiff"}
 SCRIPT = '''"""Stands in for the script {name}."""
@@ -202,10 +201,6 @@ def fail_perhaps(rule: str) -> None:
     match fault["way"]:
         case "refuse":
             raise InputError("asked to refuse", file=FAULT, remedy="none")
-        case "disk":
-            raise OSError(errno.ENOSPC, "No space left on device", "product")
-        case "defect":
-            raise RuntimeError("asked to fail")
         case "edit" | "revert":
             file = Path(fault["file"])
             text = file.read_text()

@@ -87,14 +87,9 @@ def test_an_edited_gcp_runs_what_follows_and_a_reverted_one_nothing(made, tmp_pa
     assert plan(other) == {}
 
 
-EDITED = {
+EDITED = {  # of which modules each rule's digest holds, test_rules has for all of them
     "stereotruth/tiles/export": {"export"},
-    "stereotruth/labels/project": {"project", "export"},
-    "stereotruth/epipolar/rectify": {"rectify", "project", "export"},
     "stereotruth/sensor/images": {"refine", "rectify", "project", "export"},
-    "stereotruth/align/align": STAGES,
-    "stereotruth/surface/facets": {"surface", "project", "export"},
-    "stereotruth/lidar/ingest": STAGES - {"align"} | {"ingest", "compare_strips", "surface"},
     "stereotruth/lidar/strip_comparison": {"compare_strips", "project", "export"},
     "stereotruth/core/sheets stereocities/render": set(),
 }

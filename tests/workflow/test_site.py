@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import shutil
 import subprocess
 import sys
 from datetime import date
@@ -172,28 +171,3 @@ def test_the_site_has_a_page_that_leads_to_its_pairs(site: Path) -> None:
     tiles = (site / "results/report/Stack/index.html").read_text(encoding="utf-8")
     assert len(links) == 2 and all(f'id="{link}"' in tiles for link in links)
     assert "site/Stack/index.html" in (site / "results/report/index.html").read_text()
-
-
-def test_the_order_of_the_sheets_rows_plays_no_part(site: Path, tmp_path: Path) -> None:
-    """Labels, arrays and all, are the same bytes if images, scenes and points are turned round."""
-    other = tmp_path / "turned"
-    other.mkdir()
-    shutil.copytree(site / "data", other / "data")
-    shutil.copy(site / "lidar.tsv", other)
-    for name in ("config.yaml", "cities.tsv", "images.tsv", "scenes.tsv", "gcps/Stack.csv"):
-        head, *rows = (site / name).read_text(encoding="utf-8").splitlines()
-        if name != "config.yaml":
-            rows.reverse()
-        (other / name).parent.mkdir(exist_ok=True)
-        (other / name).write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
-    stores = sorted(path.name for path in (site / "results/project/Stack").glob("*.zarr"))
-    assert len(stores) == 2
-    call(other, "run", *(f"results/project/Stack/{name}" for name in stores), "--cores", "2")
-    for name in stores:
-        arrays = {
-            file.relative_to(site): file.read_bytes()
-            for file in (site / "results/project/Stack" / name).rglob("c/*/*")
-        }
-        assert len(arrays) >= 7  # layers
-        for file, content in arrays.items():
-            assert (other / file).read_bytes() == content, file

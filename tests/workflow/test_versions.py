@@ -51,7 +51,6 @@ def test_it_runs_and_makes_again_what_is_due(snakemake, tmp_path):
     every = {"align", "ingest", "rectify", "rectify_strip", "refine"}
     assert rules() == every
     assert hollow.stale() == []
-    assert rules("--dry-run") == set()
     for file in (hollow.folder / "in").rglob("*"):
         os.utime(file)
     assert rules("--dry-run") == set()

@@ -232,7 +232,7 @@ def test_a_geoid_is_told_by_rpcs_of_two_pixels():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not MARSEILLE.is_dir(), reason="the real scene is not beside the project")
-@pytest.mark.parametrize("offset", [0.0, -49.4, 1.0])
+@pytest.mark.parametrize("offset", [0.0, 1.0])
 def test_a_fault_of_the_datum_of_a_real_scene_is_doubted(tmp_path, offset):
     """Planted in the point cloud of a real pair with control points."""
     parts = [laspy.read(file) for file in sorted((MARSEILLE / "lidar").glob("*.laz"))]

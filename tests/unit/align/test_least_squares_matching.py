@@ -21,7 +21,7 @@ def texture(rng: np.random.Generator, contrast: float) -> np.ndarray:
 def matched(template: np.ndarray, source: np.ndarray, clear: np.ndarray | None = None):
     """Shift (x, y), sigma, correlation, discord; from a start within half a pixel."""
     first = (WIDE - SIDE - 2) // 2
-    window = template[first : first + SIDE + 2, first : first + SIDE + 2].astype(np.float32)
+    window = template.astype(np.float32)[first : first + SIDE + 2, first : first + SIDE + 2]
     clear = np.ones(SIDE**2) if clear is None else clear.ravel().astype(np.float64)
     result = np.empty(5)
     middle = (WIDE - 1) / 2

@@ -100,6 +100,7 @@ def test_a_planted_shift_and_tilt_is_taken_out(found):
     assert np.abs(np.median(observations.after[observations.used], axis=0)).max() < 0.02
 
 
+@pytest.mark.slow
 def test_rpcs_alone_are_brought_together(images, points):
     left = np.array([[0.05, 0.0, 9.0], [0.0, -0.05, -6.0]])
     right = np.array([[0.0, 0.1, -8.0], [-0.05, 0.0, 11.0]])

@@ -80,6 +80,7 @@ def test_crowns_and_hills_have_no_edges():
     assert len(edges_of(cloud)) == 0
 
 
+@pytest.mark.slow
 def test_an_image_tells_how_far_its_sensor_model_is_off(images):
     edges = edges_of(points(roofs()))
     with open_pair(*images) as sources:

@@ -142,6 +142,7 @@ def test_order_of_the_pairs_plays_no_part(tmp_path):
     assert adjust_site("Town", made.pairs) == adjust_site("Town", made.pairs[::-1])
 
 
+@pytest.mark.slow
 def test_an_rpc_that_is_far_off_is_named_and_corrected(tmp_path):
     made = Site(tmp_path, {"C": (12.0, -9.0)})
     site = adjust_site("Town", made.pairs)

@@ -143,6 +143,7 @@ def test_wrong_control_points_are_left_out():
     assert fit.leave_one_out["C"][3] == pytest.approx([8.0, -5.0], abs=0.8)
 
 
+@pytest.mark.slow
 def test_an_image_that_jitters_is_corrected_by_line():
     """It swings along its columns; what its pairs tell makes one correction, and no other's."""
     made = Made(11)

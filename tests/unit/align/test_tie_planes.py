@@ -9,6 +9,7 @@ from stereotruth.align.tie_planes import GUARDS, HALF, SIDE, SitePoints
 
 WIDE = 120
 CENTRE = np.array([60, 60])
+TWICE = np.array([CENTRE, CENTRE])
 PARALLAX = np.array([-0.2, 0.9])  # px/m
 LEVEL, SLOPES = 50.0, np.array([0.11, -0.06])  # m, m/px
 
@@ -52,8 +53,8 @@ def test_what_stands_off_the_plane_is_left_out_where_either_view_shows_it(number
     rng = np.random.default_rng(9)
     cloud = np.vstack([ground(rng, 2.0), [[60.0, 55.0, LEVEL + 5.0 - 5 * SLOPES[1]]]])
     points = points_of(cloud)
-    planes, _ = points.fit_planes(CENTRE[None])
-    clear = points.clear_pixels(CENTRE[None], planes)[number, 0]
+    planes, _ = points.fit_planes(TWICE)
+    clear = points.clear_pixels(TWICE, planes)[number, 0]
     row, col = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1]
     # The point is 5 m high: at (0, -5) in the left image, at (-1, -0.5) in the right one.
     away = np.min(
@@ -70,8 +71,8 @@ def test_a_pulse_of_several_returns_and_a_hole_are_left_out():
     several = np.hypot(*(cloud[:, :2] - (65.0, 65.0)).T) < 1.0
     hole = np.hypot(*(cloud[:, :2] - (54.0, 54.0)).T) < 5.0
     points = points_of(cloud[~hole], ~several[~hole])
-    planes, _ = points.fit_planes(CENTRE[None])
-    clear = points.clear_pixels(CENTRE[None], planes)[0, 0]
+    planes, _ = points.fit_planes(TWICE)
+    clear = points.clear_pixels(TWICE, planes)[0, 0]
     row, col = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1]
     assert not clear[np.hypot(col - 5, row - 5) < 2.5].any()
     assert not clear[np.hypot(col + 6, row + 6) < 2.0].any()

@@ -106,6 +106,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 def test_each_planted_fault_is_found_by_its_check(audited):
     rows, figures = read(audited[1])
     for pair, (check, words) in FAULTS.items():
@@ -118,6 +119,7 @@ def test_each_planted_fault_is_found_by_its_check(audited):
     assert shared["share"] == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_what_is_written(audited):
     _, out, summary = audited
     names = ["README.txt", "index.html", "pairs.csv", "summary.json"]
@@ -129,6 +131,7 @@ def test_what_is_written(audited):
     assert summary["verdicts"] == {"good": 0, "undecided": 0, "fault": 11}
 
 
+@pytest.mark.slow
 def test_the_page_shows_all_pairs_in_one_picture_and_each_fault_in_a_line(audited):
     """A mark stands on the side of its label bias and parallax."""
     rows, _ = read(audited[1])

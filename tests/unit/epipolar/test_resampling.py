@@ -110,7 +110,7 @@ def test_the_window_of_the_source_does_not_matter() -> None:
     window = np.ascontiguousarray(source[86:300, 105:331])
     moved = lattice - np.array([105, 86])[:, None, None]
     part = np.zeros((160, 176), dtype=np.uint16)
-    resample(window, moved[:, 2:, 1:], 16, (1.0, 1.0), part)
+    resample(window, moved[:, 2:, 1:].copy(), 16, (1.0, 1.0), part)
     assert np.array_equal(part, whole[32:, 16:])
 
 

@@ -65,6 +65,7 @@ def project(scene: Scene, stores: list[Path], out: Path, **options) -> set[str]:
     }
 
 
+@pytest.mark.slow
 def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path):
     """And the bytes are those of a run from scratch with both files."""
     out = tmp_path / "out.zarr"
@@ -79,9 +80,9 @@ def test_one_more_file_has_only_the_blocks_made_that_it_touches(scene, tmp_path)
     other = tmp_path / "other.zarr"
     assert project(scene, [more, scene.store], other) == everything
     assert tree(out) == tree(other)
-    assert project(scene, [scene.store], out) == touched  # and without the file again
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_carried_on(scene, tmp_path, monkeypatch):
     """What the LiDAR has decided is taken over; nothing of it is left in the end."""
     whole, out = tmp_path / "whole.zarr", tmp_path / "out.zarr"
@@ -128,17 +129,13 @@ def test_another_covariance_of_the_alignment_is_another_uncertainty(scene, tmp_p
 
 @pytest.mark.slow
 def test_strips_and_the_whole_give_the_same_bytes(scene, tmp_path):
-    for view in ("left", "right"):
-        whole = tmp_path / f"{view}.zarr"
-        everything = project(scene, [scene.store], whole, view=view)
-        out = tmp_path / f"{view}-strips.zarr"
-        parts = [
-            project(scene, [scene.store], out, view=view, strip=Strip(k, 3)) for k in (2, 0, 1)
-        ]
-        assert not out.exists()
-        assert set.union(*parts) == everything and sum(map(len, parts)) == len(everything)
-        assert project(scene, [scene.store], out, view=view) == set()
-        assert tree(out) == tree(whole)
+    whole, out = tmp_path / "whole.zarr", tmp_path / "strips.zarr"
+    everything = project(scene, [scene.store], whole, view="right")
+    parts = [project(scene, [scene.store], out, view="right", strip=Strip(k, 3)) for k in (2, 0, 1)]
+    assert not out.exists()
+    assert set.union(*parts) == everything and sum(map(len, parts)) == len(everything)
+    assert project(scene, [scene.store], out, view="right") == set()
+    assert tree(out) == tree(whole)
 
 
 @pytest.mark.slow

@@ -48,17 +48,12 @@ def hidden(shape: tuple[int, int], where: tuple[slice, slice]) -> np.ndarray:
     return mask
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"recipe": "paper"}, {"recipe": "surface"}],
-    ids=str,
-)
-@pytest.mark.parametrize("view", ["left", "right"])
+@pytest.mark.parametrize(("view", "recipe"), [("left", "surface"), ("right", "paper")])
 def test_masked_pixels_of_either_view_have_a_status_and_no_label(
-    plane, masked, tmp_path, view, options
+    plane, masked, tmp_path, view, recipe
 ) -> None:
     """Those of the other view too, where the pixel's match is masked; and no others."""
-    summary = project_with(*masked, [plane.store], tmp_path / "out.zarr", view=view, **options)
+    summary = project_with(*masked, [plane.store], tmp_path / "out.zarr", view=view, recipe=recipe)
     grid = open_grid(tmp_path / "out.zarr")
     status, disparity = grid["status"].values, grid["disparity"].values
     assert grid["status"].attrs["flag_values"][-1] == Status.MASKED == 11
@@ -67,7 +62,7 @@ def test_masked_pixels_of_either_view_have_a_status_and_no_label(
     own, other = (CLOUD, SHADOW) if view == "left" else (SHADOW, CLOUD)
     own, other = hidden(status.shape, own), hidden(status.shape, other)
     clear = project_with(
-        *plane.images, [plane.store], tmp_path / "clear.zarr", view=view, **options
+        *plane.images, [plane.store], tmp_path / "clear.zarr", view=view, recipe=recipe
     )
     assert "masked" not in clear["pixels"]
     before = open_grid(tmp_path / "clear.zarr")

@@ -104,10 +104,10 @@ def test_files_of_other_software_are_read_whole(name):
     assert truth.shape[1] > 0 and np.array_equal(read(file, ground), truth)
 
 
-@pytest.mark.parametrize("form", [6, 8])
-def test_stores_of_footprints_are_those_of_the_whole_cropped(form):
-    file, rng = Path("tile.copc.laz"), np.random.default_rng(form)
-    file.write_bytes(make_copc(12_000, form=form).content)
+def test_stores_of_footprints_are_those_of_the_whole_cropped():
+    """Of points of format 8; other files here have format 6."""
+    file, rng = Path("tile.copc.laz"), np.random.default_rng(8)
+    file.write_bytes(make_copc(12_000, form=8).content)
     ingest(file, "whole.points")
     whole = PointStore("whole.points")
     west, south, east, north = whole.bounds[:4]

@@ -107,7 +107,7 @@ def test_more_epochs_go_on_and_other_settings_begin_anew(
     train(MODEL, dataset, tmp_path / "a", SHORT)
     train(MODEL, dataset, tmp_path / "b", SHORT)
     assert equal(weights(tmp_path / "a"), weights(tmp_path / "b"))
-    other = short(learning_rate=1e-4)
+    other = short(learning_rate=1e-4, epochs=1)
     train(MODEL, dataset, tmp_path / "a", other)
     train(MODEL, dataset, tmp_path / "c", other)
     assert equal(weights(tmp_path / "a"), weights(tmp_path / "c"))

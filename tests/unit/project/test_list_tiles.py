@@ -16,7 +16,6 @@ import pyproj
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products import remote_files
 from stereotruth.lidar.catalogue_list import read_list
 from stereotruth.lidar.ingest import ingest
 from stereotruth.project.add_scene import add_scene
@@ -285,34 +284,6 @@ def test_a_catalogue_of_a_server_names_no_other_host(folder):
         assert other.asked == [] and not Path("a.tsv").exists()
         listed(url, ["localhost"])
         assert all(tile.file.startswith(other.url) for tile in read_list("a.tsv").tiles)
-
-
-REDIRECTS = {
-    "another host": "http://localhost:{port}/x?sig=verysecret",
-    "a loop": "{url}",
-    "file:": "file:///etc/passwd",
-    "a password": "http://name:verysecret@127.0.0.1:{port}/x",
-    "nowhere": "",
-}
-
-
-def test_a_tile_that_its_server_redirects_or_refuses_is_not_listed(folder, monkeypatch):
-    """Nor is it taken for one that is missing."""
-    monkeypatch.setattr(remote_files, "WAIT_S", 0.01)
-    with serving() as site, serving("localhost") as other:
-        url = with_catalogue(site, folder)
-        port = other.url.rpartition(":")[2]
-        answers = [(status, {}, b"") for status in (403, 404, 503)]
-        for location in REDIRECTS.values():
-            to = location.format(url=f"{site.url}/lidar/t0.laz", port=port)
-            answers.append((302, {"Location": to} if to else {}, b""))
-        for answer in answers:
-            site.answers["/lidar/t0.laz"] = answer
-            with pytest.raises(InputError) as refused:
-                listed(url)
-            assert ("is not there" in str(refused.value)) == (answer[0] == 404)
-            assert "verysecret" not in str(refused.value) and not Path("a.tsv").exists()
-        assert other.asked == []
 
 
 def test_no_file_and_no_line_has_a_signature(folder, caplog, capsys):

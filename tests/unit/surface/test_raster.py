@@ -37,14 +37,14 @@ def surface_of(corners: np.ndarray, undecided: int) -> GroundSurface:
     flat = np.rint(corners.reshape(-1, 3) * [1e4, 1e4, 1 / LATTICE_M]).astype(np.int64)
     count = np.ones(len(flat), np.int32)
     of_points = count.astype(np.uint8), count, count.astype(np.uint16)
-    vertices = Vertices(*flat.T, *(np.zeros(len(flat), np.int64),) * 2, *of_points)
+    vertices = Vertices(*flat.T.copy(), *(np.zeros(len(flat), np.int64),) * 2, *of_points)
     corner = np.arange(len(flat), dtype=np.int32).reshape(-1, 3)
     facet, open_ = np.split(corner, [len(corner) - undecided])
     heights = flat[open_, 2]
     return GroundSurface(
-        vertices, facet, np.ones(len(facet)), np.zeros(len(facet)), open_,
+        vertices, facet, *np.float32([np.ones(len(facet)), np.zeros(len(facet))]), open_,
         np.stack([heights.min(axis=1), heights.max(axis=1)], axis=1), len(open_), NONE,
-        facet[:, 0], open_[:, 0],
+        facet[:, 0].copy(), open_[:, 0].copy(),
     )  # fmt: skip
 
 
@@ -68,9 +68,8 @@ def ray_meets(triangle: np.ndarray, x: float, y: float, d: float, prism: bool) -
     return bool((np.isfinite(height) & (ray >= low - step) & (ray <= top + step)).any())
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_both_views_see_what_rays_meet(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_both_views_see_what_rays_meet() -> None:
+    rng = np.random.default_rng(1)
     ground = np.array(
         [[[-9, 0, 0], [40, 0, 0], [-9, 40, 2]], [[40, 0, 0], [40, 40, 4], [-9, 40, 2]]]
     )

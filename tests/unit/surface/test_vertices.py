@@ -40,7 +40,7 @@ def test_places_are_those_of_whole_numbers(cell) -> None:
     size = 40 * np.array(cell)
     places = low[:, None] + rng.integers(0, size, (400, 2)).T
     corners = (low // cell + rng.integers(1, 40, (400, 2))) * cell
-    lon, lat = np.hstack([places, corners.T, corners.T - 1])
+    lon, lat = np.ascontiguousarray(np.hstack([places, corners.T, corners.T - 1]))
     scale = scale_of(1.0, cell)
     builder = VertexBuilder(scale, tuple(low.tolist()), tuple((low + size).tolist()))
     h = rng.integers(-(10**6), 10**6, lon.size)

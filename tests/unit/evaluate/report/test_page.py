@@ -95,6 +95,7 @@ def made(tmp_path_factory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_a_page_keeps_within_its_bytes_however_many_tiles(tmp_path, monkeypatch):
     write_city(tmp_path / "tiles", 12)
     monkeypatch.setattr(page, "PICTURE_BYTES", 200_000)

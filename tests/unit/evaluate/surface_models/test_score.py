@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import from_origin
-from rasterio.warp import reproject
 from scipy.ndimage import gaussian_filter
 
 from stereobench.scores.paired import compare_folders
 from stereotruth.core.errors import InputError
 from stereotruth.evaluate.surface_models import score
-from stereotruth.evaluate.surface_models.reference import RasterReference
 from stereotruth.evaluate.surface_models.score import (
     OPEN,
     SOLID,
@@ -26,7 +24,6 @@ from ....synthetic.analytic_town import (
     EPSG,
     NORTH,
     SIDE,
-    TO_WGS84,
     WEST,
     Points,
     Town,
@@ -143,6 +140,7 @@ def test_models_of_other_grids_compare_by_tiles_of_the_ground(points, tmp_path):
     assert [": worse" in line for line in told[1:]] == [True, True]
 
 
+@pytest.mark.slow
 def test_lost_roofs_are_missing_edges_and_bare_trees_stand_apart(judge, exact):
     heights = Town().heights()  # as in winter
     half = heights.shape[1] // 2
@@ -153,38 +151,6 @@ def test_lost_roofs_are_missing_edges_and_bare_trees_stand_apart(judge, exact):
     # of the rest
     assert edges["position_error_m"] == pytest.approx(exact["edges"]["position_error_m"], abs=0.05)
     assert found["errors"]["trees"]["mean_m"] == pytest.approx(-6.0, abs=0.3)
-
-
-@pytest.mark.slow
-def test_a_reference_raster_serves_and_degrees_too(exact, tmp_path):
-    """The model in degrees, by nearest neighbours; the reference in UTM, finer, unclassified."""
-    n = round(SIDE / 0.4)
-    row, col = np.mgrid[:n, :n]
-    truth, _ = TOWN.surface((col + 0.5) * 0.4, (row + 0.5) * 0.4)
-    options = {"driver": "GTiff", "count": 1, "dtype": "float32", "nodata": -9999.0}
-    with rasterio.open(
-        tmp_path / "truth.tif", "w", width=n, height=n, crs=EPSG,
-        transform=from_origin(WEST, NORTH, 0.4, 0.4), **options,
-    ) as target:  # fmt: skip
-        target.write(truth.astype(np.float32), 1)
-    model = write(tmp_path / "model.tif", TOWN.heights(*SHIFT[:2]) + SHIFT[2])
-    with rasterio.open(model) as source:
-        west, south, east, north = rasterio.warp.transform_bounds(source.crs, 4326, *source.bounds)
-        transform = from_origin(west, north, 4e-6, 4e-6)
-        out = np.full(
-            (round((north - south) / 4e-6), round((east - west) / 4e-6)), -9999.0, np.float32
-        )
-        reproject(rasterio.band(source, 1), out, dst_transform=transform, dst_crs=4326,
-                  dst_nodata=-9999.0)  # fmt: skip
-    size = {"width": out.shape[1], "height": out.shape[0]}
-    degrees = tmp_path / "degrees.tif"
-    with rasterio.open(degrees, "w", crs=4326, transform=transform, **size, **options) as target:
-        target.write(out, 1)
-    found = score_surface_model(degrees, RasterReference(tmp_path / "truth.tif")).figures()
-    for name, planted in zip(("east_m", "north_m", "up_m"), SHIFT):
-        assert abs(found["registration"][name] - planted) < 0.05
-    assert found["edges"]["edges"] > 100
-    assert "trees" not in found["errors"]  # nothing tells them
 
 
 def test_what_cannot_be_judged_is_refused(judge, points, tmp_path):
@@ -249,17 +215,3 @@ def test_slopes_are_told(judge):
     total = sum(of["points"] for name, of in errors.items() if name.startswith("ground, slope"))
     assert total > 0.9 * errors[OPEN]["points"]
     assert errors["ground, slope 30–90°"]["points"] > 0.1 * total
-
-
-@pytest.mark.slow
-def test_a_geoid_left_out_is_a_shift_up(judge, tmp_path):
-    lon, lat = TO_WGS84.transform(WEST, NORTH)
-    grid = tmp_path / "geoid.tif"
-    options = {"driver": "GTiff", "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(
-        grid, "w", width=9, height=9, transform=from_origin(lon - 1, lat + 1, 0.25, 0.25), **options
-    ) as target:
-        target.write(np.full((9, 9), -17.0, np.float32), 1)
-    orthometric = TOWN.heights() + 17.0
-    assert judge(orthometric)["registration"]["up_m"] == pytest.approx(17.0, abs=0.01)
-    assert abs(judge(orthometric, geoid=grid)["registration"]["up_m"]) < 0.01
