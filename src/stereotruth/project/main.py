@@ -14,13 +14,10 @@ import typer
 
 from .. import __version__
 from ..core.errors import InputError, told_by_system
+from .dataset_commands import app as dataset_commands
+from .dataset_commands import examples
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
-
-
-def examples(*lines: str) -> str:
-    """What stands at the end of a command's help, one line each."""
-    return "\n\n".join(["[bold]Examples[/bold]", *(f"[cyan]{line}[/cyan]" for line in lines)])
 
 
 app = typer.Typer(
@@ -41,6 +38,7 @@ scene_app = typer.Typer(no_args_is_help=True, help="The scenes of the project.")
 gcps_app = typer.Typer(no_args_is_help=True, help="Ground control points.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(gcps_app, name="gcps")
+app.add_typer(dataset_commands)
 Configured = Annotated[
     list[Path] | None,
     typer.Option("--configfile", help="Read this instead of config.yaml; may be given again."),
