@@ -7,10 +7,11 @@
                       2 contradicted by the images, 3 a nodata value that nobody declared
 ====================  =============================================================================
 
-A label d becomes ``gain * (d - pivot_px) + field_px``. ``field_px`` [k, k] lies evenly over the
-pixels, from the centre of the first to that of the last, and is bilinear between: a shift for
-k = 1, an affine function for 2, a disparity field for more. ``sigma_px`` is its standard
-uncertainty, ``gain_sigma`` that of the gain.
+A label d becomes ``gain * (d - pivot_px) + field_px``. The values of ``field_px`` [k, k] lie evenly
+over the pixels, from the centre of the first to that of the last. Between, the field is the
+polynomial of degree k - 1 in row and in column through them: a shift for k = 1, affine along rows
+and columns for 2, a disparity field for more. ``sigma_px`` has their standard uncertainties,
+``gain_sigma`` is that of the gain.
 """
 
 from __future__ import annotations
@@ -73,12 +74,16 @@ FOLDS = 8
 LARGEST_LOSS_PX = 1.0  # of a match that a correction misses
 SURE = 3.0  # standard errors by which a correction with more unknowns must be better,
 WORTH_PX = 0.02  # and change labels by in the mean
-SUPPORT = 5.0  # matches, by weight, that a knot needs
+SUPPORT = 3.0  # sum of squared weights of the matches that a knot needs
 
 
-def _hats(places: Floats, knots: int) -> Floats:
-    """Linear weights [n, knots] of knots 0, 1, … at places [n]."""
-    return np.maximum(1.0 - np.abs(places[:, None] - np.arange(knots)), 0.0)
+def _weights(places: Floats, knots: int) -> Floats:
+    """Lagrange's weights [n, knots] of knots 0, 1, … at places [n]."""
+    found = np.ones((places.size, knots))
+    for one in range(knots):
+        for other in set(range(knots)) - {one}:
+            found[:, one] *= (places - other) / (one - other)
+    return found
 
 
 def _square(values: Floats) -> Square:
@@ -103,7 +108,7 @@ class Correction:
     def apply(self, labels: Labels) -> Labels:
         """The corrected labels."""
         knots = len(self.field_px)
-        down, across = (_hats(np.linspace(0, knots - 1, n), knots) for n in labels.shape)
+        down, across = (_weights(np.linspace(0, knots - 1, n), knots) for n in labels.shape)
         field = down @ np.array(self.field_px).reshape(knots, knots) @ across.T
         return (self.gain * (labels.astype(np.float64) - self.pivot_px) + field).astype(np.float32)
 
@@ -115,10 +120,10 @@ def _candidates(
     middle, reach = scale_of_labels(values)
     for knots in KNOTS:
         down, across = (
-            _hats(v / (size - 1) * (knots - 1), knots) for v, size in zip((y, x), shape)
+            _weights(v / (size - 1) * (knots - 1), knots) for v, size in zip((y, x), shape)
         )
         design = (down[:, :, None] * across[:, None, :]).reshape(x.size, -1)
-        if design.sum(axis=0).min() < SUPPORT:
+        if np.square(design).sum(axis=0).min() < SUPPORT:
             return
         yield knots, design
         if reach >= LEAST_REACH_PX:
