@@ -17,11 +17,13 @@ and columns for 2, a disparity field for more. ``sigma_px`` has their standard u
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -62,7 +64,6 @@ log = logging.getLogger("stereotruth")
 
 Floats = NDArray[np.float64]
 Labels = NDArray[np.float32]  # [h, w] px, NaN: none
-Square = tuple[tuple[float, ...], ...]
 
 ERRATA = "errata.json"
 MENDED = ("values", "convention", "bias", "hidden", "contradicted")  # checks
@@ -74,7 +75,7 @@ FOLDS = 8
 LARGEST_LOSS_PX = 1.0  # of a match that a correction misses
 SURE = 3.0  # standard errors by which a correction with more unknowns must be better,
 WORTH_PX = 0.02  # and change labels by in the mean
-SUPPORT = 3.0  # sum of squared weights of the matches that a knot needs
+SUPPORT = 1.0  # sum of squared weights of the matches that a knot needs
 
 
 def _weights(places: Floats, knots: int) -> Floats:
@@ -86,96 +87,77 @@ def _weights(places: Floats, knots: int) -> Floats:
     return found
 
 
-def _square(values: Floats) -> Square:
-    return tuple(tuple(row) for row in values.tolist())
-
-
-@dataclass(frozen=True)
-class Correction:
-    """Of a pair's labels, see above; a square of numbers is a tuple of its rows."""
+class Correction(NamedTuple):
+    """Of a pair's labels, see above."""
 
     gain: float = 1.0
     gain_sigma: float = 0.0
     pivot_px: float = 0.0
-    field_px: Square = ((0.0,),)
-    sigma_px: Square = ((0.0,),)
-
-    @property
-    def kind(self) -> str:
-        """Shift, affine or field."""
-        return {1: "shift", 2: "affine"}.get(len(self.field_px), "field")
+    field_px: Sequence[Sequence[float]] = ((0.0,),)
+    sigma_px: Sequence[Sequence[float]] = ((0.0,),)
 
     def apply(self, labels: Labels) -> Labels:
         """The corrected labels."""
         knots = len(self.field_px)
         down, across = (_weights(np.linspace(0, knots - 1, n), knots) for n in labels.shape)
-        field = down @ np.array(self.field_px).reshape(knots, knots) @ across.T
+        field = down @ np.array(self.field_px) @ across.T
         return (self.gain * (labels.astype(np.float64) - self.pivot_px) + field).astype(np.float32)
 
 
-def _candidates(
-    x: Floats, y: Floats, values: Floats, shape: tuple[int, int]
-) -> Iterator[tuple[int, Floats]]:
-    """Knots and design [n, p] of the corrections that may be tried, fewest unknowns first."""
+def _designs(x: Floats, y: Floats, values: Floats, shape: tuple[int, int]) -> Iterator[Floats]:
+    """Designs [n, p] of corrections, fewest unknowns first: knots, and perhaps the gain."""
     middle, reach = scale_of_labels(values)
     for knots in KNOTS:
-        down, across = (
-            _weights(v / (size - 1) * (knots - 1), knots) for v, size in zip((y, x), shape)
-        )
+        down, across = (_weights(v / (n - 1) * (knots - 1), knots) for v, n in zip((y, x), shape))
         design = (down[:, :, None] * across[:, None, :]).reshape(x.size, -1)
-        if np.square(design).sum(axis=0).min() < SUPPORT:
-            return
-        yield knots, design
-        if reach >= LEAST_REACH_PX:
-            yield knots, np.column_stack([design, values - middle])
-
-
-def _fitted(design: Floats, values: Floats) -> Floats:
-    return reweighted_fit(design, values, tukey_weights, least_sigma=SMALLEST_SCALE)
+        if np.square(design).sum(axis=0).min() >= SUPPORT:
+            yield design
+            if reach >= LEAST_REACH_PX:
+                yield np.column_stack([design, values - middle])
 
 
 def fit_correction(
-    x: Floats, y: Floats, labels: Floats, offsets: Floats, shape: tuple[int, int], sign: float
+    x: Floats, y: Floats, labels: Floats, offsets: Floats, shape: tuple[int, int]
 ) -> Correction | None:
-    """The correction with as few unknowns as explain ``offsets`` [n], px, of labels at pixels.
+    """The correction with as few unknowns as explain ``offsets`` [n], px, of ``labels`` at pixels.
 
-    ``labels`` [n] have their ``sign``. More unknowns are taken only if they foretell the matches
-    of cells that they are not fitted to. None: there are too few matches.
+    More unknowns are taken only if they foretell the matches of cells that they are not fitted to.
+    None: there are too few matches.
     """
+    fitted = partial(reweighted_fit, weights_of=tukey_weights, least_sigma=SMALLEST_SCALE)
     groups = cells(x, y)
     names, group = np.unique(groups, return_inverse=True)
     middle = float(np.median(offsets))
     values = offsets - middle
     best = None
-    for knots, design in _candidates(x, y, labels, shape):
+    for design in _designs(x, y, labels, shape):
         if names.size <= max(FOLDS, design.shape[1]):
             break
-        missed, change = np.empty(values.size), design @ _fitted(design, values)
+        missed, change = np.empty(values.size), design @ fitted(design, values)
         for out in (group % FOLDS == fold for fold in range(FOLDS)):
-            missed[out] = values[out] - design[out] @ _fitted(design[~out], values[~out])
+            missed[out] = values[out] - design[out] @ fitted(design[~out], values[~out])
         loss = np.minimum(np.abs(missed), LARGEST_LOSS_PX)
         if best is not None:
-            gain = np.bincount(group, best[2] - loss, names.size)
+            gain = np.bincount(group, best[1] - loss, names.size)
             sure = gain.sum() > SURE * np.sqrt(names.size) * gain.std(ddof=1)
-            if not sure or np.abs(change - best[3]).mean() < WORTH_PX:
+            if not sure or np.abs(change - best[2]).mean() < WORTH_PX:
                 continue
-        best = knots, design, loss, change
-    found = [] if best is None else robust_fit(best[1], values, groups)
-    if best is None or not np.isfinite([of.error for of in found]).all():
+        best = design, loss, change
+    found = [] if best is None else robust_fit(best[0], values, groups)
+    if not found or not np.isfinite([of.error for of in found]).all():
         return None
-    count = best[0] ** 2
+    knots = math.isqrt(len(found))
     value, error = (np.array([getattr(of, name) for of in found]) for name in ("value", "error"))
-    field, sigma = (v[:count].reshape(best[0], best[0]) for v in (value + middle, error))
-    if len(found) == count:
-        return Correction(sign, 0.0, 0.0, _square(field), _square(sigma))
-    pivot, gain = scale_of_labels(labels)[0], sign * (1.0 + float(value[count]))
-    square = _square(field + pivot), _square(sigma)
-    return Correction(gain, float(error[count]), sign * pivot, *square)
+    field, sigma = (v[: knots * knots].reshape(knots, knots) for v in (value + middle, error))
+    if len(found) == knots * knots:
+        return Correction(field_px=field.tolist(), sigma_px=sigma.tolist())
+    pivot, gain = scale_of_labels(labels)[0], (1.0 + float(value[-1]), float(error[-1]))
+    return Correction(*gain, pivot, (field + pivot).tolist(), sigma.tolist())
 
 
 @dataclass(eq=False)
 class _Mending:
-    """A faulty pair on its way to right labels; ``level`` of the tests."""
+    """A faulty pair, of so many ``pairs``, on its way to right labels."""
 
     dataset: StereoDataset
     a: Audited
@@ -228,7 +210,7 @@ class _Mending:
         return bool(self.mask.any()) or self.correction != Correction()
 
     def fit(self) -> None:
-        """Find the correction, of the sign that the labels have."""
+        """Find the correction; its fit is to labels of the right sign."""
         sign, images = self.correction.gain, (grey(self.left), grey(self.right))
         for _ in range(FITS):
             labels = self.labels
@@ -238,8 +220,9 @@ class _Mending:
             at = y.astype(int), x.astype(int)
             given = sign * self.given[at].astype(np.float64)
             offsets = labels[at] - errors[known] - given
-            found = fit_correction(x, y, given, offsets, labels.shape, sign)
-            self.correction = found or self.correction
+            if found := fit_correction(x, y, given, offsets, labels.shape):
+                pivot, gain = sign * found.pivot_px, sign * found.gain
+                self.correction = found._replace(gain=gain, pivot_px=pivot)
 
     def mask_values(self) -> None:
         """Mask values that stand for nodata, as the corrected labels on them are wrong."""
@@ -272,8 +255,8 @@ def write_errata(
                 "pair": name,
                 "disparity": file.relative_to(dataset.root).as_posix(),
                 "disparity_sha256": file_sha256(file),
-                "kind": job.correction.kind,
-                **asdict(job.correction),
+                "kind": {1: "shift", 2: "affine"}.get(len(job.correction.field_px), "field"),
+                **job.correction._asdict(),
                 "masked": {of: int((job.mask == k).sum()) for k, of in MEANINGS.items()},
                 "why": [f.text for f in a.of(FAULT) if f.check in MENDED],
                 "left": [f.text for f in job.left_over],
@@ -349,9 +332,8 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
 
 
 def _corrected(file: Path, record: Mapping[str, Any], delta: Path, nodata: float | None) -> Labels:
-    names = asdict(Correction())
     labels = read_disparity(file, np.nan if nodata is None else nodata)
-    corrected = Correction(**{name: record[name] for name in names}).apply(labels)
+    corrected = Correction(*(record[name] for name in Correction._fields)).apply(labels)
     if "mask" in record:
         mask = delta / path_below(record["mask"], "a mask", delta / ERRATA)
         if not mask.is_file() or file_sha256(mask) != record["mask_sha256"]:

@@ -35,8 +35,8 @@ GEOZARR = [  # conventions of Zarr, by which GDAL and rioxarray find system and 
     },
 ]
 PLACE = (  # attributes of a grid
-    *("zarr_conventions", "proj:code", "spatial:dimensions", "spatial:shape", "place"),
-    *("spatial:transform_type", "spatial:transform", "spatial:bbox", "spatial:registration"),
+    *("zarr_conventions", "proj:code", "place"),
+    *("spatial:dimensions", "spatial:transform", "spatial:bbox"),
 )
 PLACES = 9  # along each side of a grid, that its place on a map is taken from
 
@@ -206,11 +206,8 @@ def coarse_place(model: EpipolarModel, view: str = "left") -> dict[str, Any]:
         "zarr_conventions": GEOZARR,
         "proj:code": "EPSG:4326",
         "spatial:dimensions": ["y", "x"],
-        "spatial:shape": [rows, cols],
-        "spatial:transform_type": "affine",
         "spatial:transform": fit.T.ravel().tolist(),
         "spatial:bbox": [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()],
-        "spatial:registration": "pixel",
         "place": f"coarse, to find the grid on a map: within {off[0]:.1f} m at {heights[0]:.0f} m "
         f"above the ellipsoid, {off.max():.0f} m from {heights[1]:.0f} to {heights[2]:.0f} m",
     }

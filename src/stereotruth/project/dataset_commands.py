@@ -33,9 +33,6 @@ def audit(
     ],
     to: Annotated[Path, typer.Option(help="Folder to be written: index.html, pairs.csv …")],
     nodata: Annotated[float, typer.Option(help="Value of pixels without a label.")] = -999.0,
-    falls_with_height: Annotated[
-        bool, typer.Option("--falls-with-height", help="Disparities decrease with height.")
-    ] = False,
     delta: Annotated[
         Path | None, typer.Option(help="Folder for corrected labels, see errata apply.")
     ] = None,
@@ -49,7 +46,7 @@ def audit(
 
     if disparities[0] >= disparities[1]:
         raise InputError(f"--range {disparities} is empty", remedy="give the smallest one first")
-    given = StereoDataset(to.name, dataset, layout, disparities, nodata, not falls_with_height)
+    given = StereoDataset(to.name, dataset, layout, disparities, nodata)
     work = to.with_name(f"{to.name}.work")
     summary = audit_dataset(given, to, Audit(), work=work, delta=delta)
     for line in summary["statements"]:

@@ -88,13 +88,9 @@ def write_packages(
             samples = [load(row) for row in of[first : first + SHARD_PAIRS]]
             for sample in samples:
                 found = {name: (sample[name].shape, str(sample[name].dtype)) for name in ARRAYS}
-                kinds = kinds or found
-                if found != kinds:
-                    raise InputError(
-                        f"tile {sample['tile']} is of {found}, others of {kinds}",
-                        file=folder,
-                        remedy=f"make all tiles alike, or leave out layout {layout}",
-                    )
+                if found != (kinds := kinds or found):
+                    problem = f"tile {sample['tile']} is of {found}, others of {kinds}"
+                    raise InputError(problem, file=folder, remedy="make all tiles alike")
             name = NAMES[layout].format(split, first // SHARD_PAIRS)
             {"parquet": _parquet, "webdataset": _shard}[layout](folder / name, samples)
             said = {"shard": name, "shard_sha256": file_sha256(folder / name)}
@@ -103,17 +99,11 @@ def write_packages(
     features = PLAIN | dict.fromkeys(PICTURES, "image")
     for name, (shape, dtype) in kinds.items():
         features[name] = {f"array{len(shape)}_d": {"shape": list(shape), "dtype": dtype}}
+    files = [{"split": of["name"], "path": f"data/{of['name']}-*"} for of in splits]
     front: dict[str, Any] = {
         "license": license_name,
         "tags": ["stereo-matching", "disparity", "satellite", "remote-sensing"],
-        "configs": [
-            {
-                "config_name": "default",
-                "data_files": [
-                    {"split": of["name"], "path": f"data/{of['name']}-*"} for of in splits
-                ],
-            }
-        ],
+        "configs": [{"config_name": "default", "data_files": files}],
     }
     if layout == "parquet":  # WebDataset's own reader finds the features
         front["dataset_info"] = {
@@ -151,10 +141,8 @@ def _parquet(path: Path, samples: Sequence[Sample]) -> None:
         import pyarrow as pa
         from pyarrow import parquet
     except ModuleNotFoundError as error:
-        raise InputError(
-            f"dataset.layouts: parquet needs {error.name}, which is not installed",
-            remedy=f"{install_extra('catalog')}; or leave it out",
-        ) from None
+        problem = f"dataset.layouts: parquet needs {error.name}, which is not installed"
+        raise InputError(problem, remedy=install_extra("catalog")) from None
 
     def nested(array: NDArray[Any]) -> pa.Array:
         found = pa.array(array.reshape(-1))
