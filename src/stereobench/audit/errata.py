@@ -43,7 +43,13 @@ from stereotruth.core.products.files import (
     write_table,
 )
 from stereotruth.core.products.provenance import file_sha256
-from stereotruth.core.products.rasters import read_disparity, read_image, write_corrected
+from stereotruth.core.products.rasters import (
+    KITTI_STEPS,
+    read_disparity,
+    read_image,
+    read_labels,
+    write_tiff,
+)
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from .estimates import SMALLEST_SCALE, cells, robust_fit, share
@@ -172,7 +178,11 @@ class _Mending:
         self.correction = Correction()
         strays = [value for value, _ in self.a.figures["labels"]["strays"]]
         self.mask[np.isin(self.given, np.array(strays, np.float32))] = NODATA
-        self.measure()
+        self.figures = self.a.figures
+        if strays:
+            self.measure()
+        else:
+            self.judge()
 
     @property
     def labels(self) -> Labels:
@@ -180,10 +190,14 @@ class _Mending:
         return self.correction.apply(np.where(self.mask > 0, np.float32(np.nan), self.given))
 
     def measure(self) -> None:
-        """Judge the labels as far as they are mended."""
+        """Measure and judge the labels as far as they are mended."""
         grows = self.dataset.grows_with_height
         found = measure_arrays(self.left, self.right, self.labels, self.matches, grows=grows)
         self.figures = {**self.a.figures, **found}
+        self.judge()
+
+    def judge(self) -> None:
+        """Judge what was measured."""
         findings = judge(self.figures, self.limits, self.pairs)
         self.left_over = [f for f in findings if f.level == FAULT and f.check != "values"]
         self.faults = {finding.check for finding in self.left_over}
@@ -317,8 +331,7 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
             target = scratch / file.relative_to(dataset)
             target.parent.mkdir(parents=True, exist_ok=True)
             if file in found:
-                labels = _corrected(file, found[file], delta, said["nodata"])
-                write_corrected(file, target, labels, said["nodata"])
+                _write_corrected(file, target, found[file], delta, said["nodata"])
             else:
                 shutil.copyfile(file, target)
         if (manifest := scratch / "manifest.csv").is_file():
@@ -331,7 +344,10 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
     return len(found)
 
 
-def _corrected(file: Path, record: Mapping[str, Any], delta: Path, nodata: float | None) -> Labels:
+def _write_corrected(
+    file: Path, target: Path, record: Mapping[str, Any], delta: Path, nodata: float | None
+) -> None:
+    """Write the labels of a file as its errata have them, with the nodata value of the file."""
     labels = read_disparity(file, np.nan if nodata is None else nodata)
     corrected = Correction(*(record[name] for name in Correction._fields)).apply(labels)
     if "mask" in record:
@@ -339,4 +355,12 @@ def _corrected(file: Path, record: Mapping[str, Any], delta: Path, nodata: float
         if not mask.is_file() or file_sha256(mask) != record["mask_sha256"]:
             raise InputError("not what was written", file=mask, remedy="get the errata again")
         corrected[read_image(mask) > 0] = np.nan
-    return corrected
+    known = np.isfinite(corrected)
+    if file.suffix.lower() == ".png":  # of KITTI
+        steps = np.rint(corrected.astype(np.float64) * KITTI_STEPS)
+        stored = np.where(known & (steps >= 1) & (steps <= 65535), steps, 0).astype(np.uint16)
+        cv2.imwrite(str(target), stored)
+    else:
+        tag = read_labels(file)[1]
+        none = next((value for value in (tag, nodata) if value is not None), np.nan)
+        write_tiff(target, np.where(known, corrected, np.float32(none)), nodata=tag)

@@ -10,8 +10,15 @@ import numpy as np
 import pytest
 
 from stereobench.audit.audit import audit
-from stereobench.audit.errata import Correction, apply_errata, fit_correction, read_errata
+from stereobench.audit.errata import (
+    Correction,
+    apply_errata,
+    fit_correction,
+    read_errata,
+    write_errata,
+)
 from stereobench.audit.pair import estimate, measure
+from stereobench.audit.verdicts import Audited, judge
 from stereotruth.core.config.methods import Audit
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import read_table, sealed, write_table
@@ -71,7 +78,11 @@ def test_planted_faults_are_mended_and_right_labels_stay(tmp_path):
         scene = scenes[f"KM_{number}"] = make(100 + number)
         given = scene.exact if name.startswith("hidden") else scene.labels
         write_pair(root, "KM", number, scene.left, scene.right, fault(given.copy()))
-    audit(whu(root), tmp_path / "a", LIMITS, work=tmp_path / "work", delta=tmp_path / "delta")
+    dataset, audited = whu(root), []
+    for pair in dataset.pairs():
+        figures = measure(dataset, pair)
+        audited.append(Audited(pair, figures, judge(figures, LIMITS, len(PLANTED))))
+    write_errata(tmp_path / "delta", dataset, audited, LIMITS)
     said = read_errata(tmp_path / "delta")
     kinds = {tile["pair"]: tile["kind"] for tile in said["tiles"]}
     assert not said["not_mended"] and len(kinds) == len(PLANTED) - 2

@@ -478,26 +478,3 @@ def write_disparity(path: str | Path, disparity: NDArray[np.float32]) -> None:
         ) as target,
     ):
         target.write(disparity, 1)
-
-
-def write_corrected(
-    source: str | Path, target: Path, disparity: NDArray[np.float32], nodata: float | None
-) -> None:
-    """Write a corrected copy of a disparity map: its place, type of file and nodata stay.
-
-    TIFFs get floats of 32 bits. ``nodata``: of a TIFF that declares none; None: NaN.
-    """
-    with _opened(source) as given:
-        same = {name: getattr(given, name) for name in ("driver", "width", "height", "count")}
-        tag, is_kitti = given.nodata, _is_kitti(given)
-        if given.crs is not None:
-            same |= {"crs": given.crs, "transform": given.transform}
-    if is_kitti:
-        steps = np.rint(disparity.astype(np.float64) * KITTI_STEPS)
-        stored = np.where((steps >= 1) & (steps <= 65535), steps, 0).astype(np.uint16)
-    else:
-        none = next((value for value in (tag, nodata) if value is not None), np.nan)
-        stored = np.where(np.isfinite(disparity), disparity, np.float32(none))
-        same |= {"nodata": tag, "compress": "deflate", "predictor": 1}
-    with open_raster(target, "w", dtype=stored.dtype, **same) as sink:
-        sink.write(stored, 1)
