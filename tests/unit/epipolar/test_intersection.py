@@ -137,10 +137,9 @@ def test_maps_show_a_grid_within_the_stated_distance(of_scene, view):
     y, x = np.mgrid[5 : rows - 5 : 50, 5 : cols - 5 : 50].astype(float)
     shown_lon, shown_lat = (p * (x + 0.5) + q * (y + 0.5) + r for p, q, r in ((a, b, c), (d, e, f)))
     image, sensor_of = getattr(of_scene, f"{view}_image"), getattr(of_scene, view)
-    for height, stated in (
-        (of_scene.reference_height, near + 0.1),
-        *((height, far + 1.0) for height in of_scene.height_range),
-    ):
+    least, greatest = of_scene.height_range
+    levels = {least: far + 1.0, greatest: far + 1.0, of_scene.reference_height: near + 0.1}
+    for height, stated in levels.items():
         lon, lat = sensor_of.localize(*image.inverse(x, y), height)
         off = np.hypot((lon - shown_lon) * np.cos(np.radians(lat)), lat - shown_lat) * 111_320
         assert np.nanmax(off) <= stated
