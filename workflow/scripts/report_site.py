@@ -24,6 +24,7 @@ if __name__ == "__main__":
             images,
             rate(images, roughness_m([PointStore(path) for path in given.points])),
             snakemake.output[0],
+            files={name: file for name, (file, *_) in snakemake.params.images.items()},
             scenes=snakemake.params.scenes,
             adjusted=read_json(given.adjusted[0]) if given.adjusted else {},
             closure=read_json(given.closure[0]) if given.closure else {},

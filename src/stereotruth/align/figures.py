@@ -11,10 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
-from rasterio.enums import Resampling
 
 from ..core.products.files import read_table
-from ..core.products.rasters import open_raster
+from ..core.products.rasters import image_shape, read_overview
 from ..pages.pictures import DIFFERENCES, round_length, save_figure, stretch
 from .alignment import Alignment, ViewFit
 
@@ -173,11 +172,8 @@ def _draw_sites(axes: Sequence[Axes], ties: _Ties) -> None:
 
 def _draw_over_image(axes: Sequence[Axes], ties: _Ties, left_image: str | Path) -> None:
     """Tie points over the left image, coloured by the residual of the disparity."""
-    with open_raster(left_image) as source:
-        rows, cols = source.shape
-        step = max(1.0, max(source.shape) / PICTURE_PX)
-        shape = tuple(max(int(n / step), 1) for n in source.shape)
-        picture = stretch(source.read(1, out_shape=shape, resampling=Resampling.average))
+    rows, cols = image_shape(left_image)
+    picture = stretch(read_overview(left_image, PICTURE_PX))
     limit = max(float(np.percentile(np.abs(ties.before[:, 0]), 90)), 0.05)
     for ax, word, values in zip(axes, ("before", "after"), (ties.before[:, 0], ties.after[:, 0])):
         ax.imshow(picture, cmap="gray", extent=(-0.5, cols - 0.5, rows - 0.5, -0.5))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.enums import ColorInterp, MaskFlags
+from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 from rasterio.windows import Window
 
@@ -383,6 +383,17 @@ def image_shape(path: str | Path) -> tuple[int, int]:
     """Rows and columns of an image. Raises InputError if it cannot be read."""
     with _opened(path) as source:
         return source.shape
+
+
+def read_overview(path: str | Path, side_px: int) -> NDArray[Any]:
+    """Band 1 of an image [h, w], in means over its pixels; the longer side has ``side_px`` at most.
+
+    Raises InputError if it cannot be read.
+    """
+    with _opened(path) as source:
+        step = max(1.0, max(source.shape) / side_px)
+        shape = tuple(max(int(n / step), 1) for n in source.shape)
+        return source.read(1, out_shape=shape, resampling=Resampling.average)
 
 
 def read_disparity(path: str | Path, nodata: float = -999.0) -> NDArray[np.float32]:

@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 
 from ...core.numerics.geometry import metres_per_degree
+from ...core.products.rasters import read_overview
 from ...pages.figures import AXES, Chart, Plot, look, on_the_ground, styled
 from ...pages.page import way, write_page
-from ...pages.pictures import DISPARITIES, Scale
-from ...pages.tables import Table, table
+from ...pages.pictures import DISPARITIES, Scale, encode, stretch
+from ...pages.tables import Cell, Table, cells_of, table, words
 from ...sensor.pair_geometry import ray_upwards
 from ...sensor.site_pairs import Links, RatedPair, SiteImage
 
 TEMPLATE = Path(__file__).with_name("site_page.html.jinja")
+LOOK_PX, LOOK_BYTES = 160, 6_000  # of an image's picture
 FIRST_DAY = 1.0  # below it, the axis of days is linear
 
 
@@ -27,6 +29,7 @@ def write_site_page(
     pairs: Sequence[RatedPair],
     out: str | Path,
     *,
+    files: Mapping[str, str | Path],
     scenes: Mapping[str, Sequence[str]],
     adjusted: Mapping[str, Any],
     closure: Mapping[str, Any],
@@ -35,9 +38,10 @@ def write_site_page(
 ) -> None:
     """Write the page of a site to ``out``.
 
-    ``pairs``: best first; ``scenes``: names of the images of each, in any order; ``adjusted``,
-    ``closure``: records of ``results/adjust`` and ``results/closure``, empty if there are none;
-    ``page``: of the city's scenes and tiles, None if there is none; ``index``: of all pages.
+    ``pairs``: best first; ``files``: of the images, by name; ``scenes``: names of the images of
+    each, in any order; ``adjusted``, ``closure``: records of ``results/adjust`` and
+    ``results/closure``, empty if there are none; ``page``: of the city's scenes and tiles, None
+    if there is none; ``index``: of all pages.
     """
     names = {frozenset(pair): scene for scene, pair in scenes.items()}
     rows = _pair_rows(pairs, names)
@@ -49,7 +53,7 @@ def write_site_page(
         "page": way(out, page),
         "map": _map(images),
         "chart_of_pairs": _chart(rows, way(out, page)),
-        "images": _images_table(images),
+        "images": _images_table(images, files),
         "pairs": table(rows, links={"scene": links if page else {}}),
         "counts": (len(images), len(pairs), len(made)),
         "residuals": _residuals(adjusted),
@@ -168,13 +172,15 @@ def _chart(rows: Sequence[Mapping[str, str]], page: str | None) -> Chart | None:
     return plot.chart(dated)
 
 
-def _images_table(images: Sequence[SiteImage]) -> Table | None:
-    """When and from where each image was taken, angles at its middle."""
-    rows = []
+def _images_table(images: Sequence[SiteImage], files: Mapping[str, str | Path]) -> Table | None:
+    """What each image shows, when and from where it was taken; angles at its middle."""
+    rows, looks = [], []
     for image in images:
         cols, lines = image.size
         middle = (cols - 1) / 2, (lines - 1) / 2, float(image.sensor.rpc.height_off)
         upwards = float(ray_upwards(image.sensor, *middle)[2])
+        picture = stretch(read_overview(files[image.name], LOOK_PX))
+        looks.append(Cell(f"picture of {image.name}", "", pictures=(encode(picture, LOOK_BYTES),)))
         rows.append(
             {
                 "image": image.name,
@@ -184,7 +190,8 @@ def _images_table(images: Sequence[SiteImage]) -> Table | None:
                 "sun_elevation_degrees": _number(image.sun and image.sun[1], ".1f"),
             }
         )
-    return table(rows)
+    lines = [(look, *cells_of(row, row)) for look, row in zip(looks, rows)]
+    return Table.of(["picture", *map(words, rows[0])], lines, words=(0, 1, 2)) if rows else None
 
 
 def _number(value: Any, form: str = ".3f") -> str:

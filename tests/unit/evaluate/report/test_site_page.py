@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from stereocities.sites import drawn_site
 from stereotruth.core.numerics.geometry import metres_per_degree
+from stereotruth.core.products.rasters import write_tiff
 from stereotruth.evaluate.report.site_page import write_site_page
 from stereotruth.sensor.site_pairs import rate
 
@@ -43,8 +46,10 @@ def written(
     folder: Path, adjusted: dict, closure: dict, page: str | None, scenes: dict = SCENES
 ) -> Path:
     out = folder / "index.html"
+    write_tiff(folder / "image.tif", np.arange(200 * 320).reshape(200, 320).astype(np.uint16))
+    files = dict.fromkeys(NAMES, folder / "image.tif")
     given = {"adjusted": adjusted, "closure": closure, "page": page, "index": None}
-    write_site_page("City", IMAGES, PAIRS, out, scenes=scenes, **given)
+    write_site_page("City", IMAGES, PAIRS, out, files=files, scenes=scenes, **given)
     return out
 
 
@@ -66,9 +71,13 @@ def test_residuals_and_closure_are_shown_as_they_are(tmp_path):
     assert '<a href="report.html#scene-A-b">A-b</a>' in text
     assert "&lt;b&gt;" in text and "<b>" not in text.partition("</header>")[2]
     (first, _, last) = cells(text, "images")
-    assert first[0] == "A" and first[1] == f"{A.time:%Y-%m-%d %H:%M}"
-    assert first[3:] == [f"{angle:.1f}" for angle in A.sun] and last[1:] != first[1:]
-    assert last[1] == last[3] == ""
+    assert first[1] == "A" and first[2] == f"{A.time:%Y-%m-%d %H:%M}"
+    assert first[4:] == [f"{angle:.1f}" for angle in A.sun] and last[2:] != first[2:]
+    assert last[2] == last[4] == ""
+    data = base64.b64decode(re.search(r"base64,([^\"]*)", first[0])[1])
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture.shape == (100, 160)
+    assert picture[5, 80] < picture[50, 80] < picture[95, 80]
     assert len(cells(text, "pairs")) == len(PAIRS) == 3
 
 
