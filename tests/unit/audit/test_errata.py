@@ -108,7 +108,7 @@ def test_planted_faults_are_mended_and_right_labels_stay(tmp_path):
             assert error[there].max() <= 1e-6, name
     assert kinds["KM_11"] == kinds["KM_12"] == "affine" and kinds["KM_13"] == "field"
     size = sum(file.stat().st_size for file in (tmp_path / "delta").rglob("*") if file.is_file())
-    assert size < 0.05 * sum(file.stat().st_size for file in (root / "disp").iterdir())
+    assert size < 0.1 * sum(file.stat().st_size for file in (root / "disp").iterdir())
 
 
 @pytest.mark.slow
