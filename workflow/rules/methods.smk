@@ -7,6 +7,7 @@ from snakemake.logging import logger
 
 from stereobench.methods.kinds import KINDS, kind_of
 from stereotruth.core.config.methods import SceneMatching
+from stereotruth.tiles.seals import is_shut
 
 
 def dataset_settings(name):
@@ -40,6 +41,11 @@ def dataset_folder(name):
 def is_own_dataset(name):
     """Whether the workflow makes the dataset."""
     return dataset_folder(name) == "dataset"
+
+
+def is_sealed(name):
+    """Whether a dataset's labels are to be opened later, so that nobody can score as yet."""
+    return is_shut(dataset_settings(name).root)
 
 
 def method_settings(name):

@@ -17,7 +17,6 @@ if __name__ == "__main__":
             snakemake.input.scores,
             snakemake.input.predictions,
             Path(snakemake.output.page).parent,
-            seed=params.seed,
             index=INDEX,
         )
         write_index()

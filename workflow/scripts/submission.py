@@ -6,4 +6,5 @@ from stereotruth.core.products.making import rule_job
 if __name__ == "__main__":
     of = snakemake.wildcards
     with rule_job(snakemake, f"submission {of.dataset} {of.method}"):
-        pack(snakemake.input.predictions, snakemake.input.scores, snakemake.output[0])
+        scores = next(iter(snakemake.input.scores), None)  # none of sealed labels
+        pack(snakemake.input.predictions, scores, snakemake.output[0])

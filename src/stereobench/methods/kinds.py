@@ -29,7 +29,7 @@ IMPORTERS = ("import_module", "__import__", "spec_from_file_location", "run_path
 
 FOLDER = "folder"
 # keys of an entry that change no result
-TOLD = ("label", "fine_tuned_of", "licence", "version", "trained_on")
+TOLD = ("label", "fine_tuned_of", "licence", "version", "trained_on", "seed", "by")
 MOVED = ("polarity", "outside")  # of any kind
 PATHS = ("weights", "folder", "pipeline", "function")  # settings that name a file
 ENTRY_POINTS = "stereotruth.methods"

@@ -34,6 +34,7 @@ from stereotruth.pages.tables import Table as Shown
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from . import panels
+from .paired import differences
 from .prediction_files import read_prediction
 from .protocols import one_id
 from .published import PUBLISHED
@@ -45,7 +46,6 @@ from .tables import (
     by_city,
     by_strata,
     dataset_in_words,
-    differences,
     error_figures,
     of_figures,
     of_fine_tuned,
@@ -79,19 +79,18 @@ def compare(
     predictions: Sequence[str | Path],
     out: str | Path,
     *,
-    seed: int,
     index: str | Path | None = None,
 ) -> None:
     """Write tables, ``figure10.png`` and ``index.html`` to ``out``.
 
-    ``scores``, ``predictions``: folders of the methods, in one order; ``seed``: of the samples that
-    intervals of differences come from; ``index``: the page of all pages, for a link.
+    ``scores``, ``predictions``: folders of the methods, in one order; ``index``: the page of all
+    pages, for a link.
 
     Raises InputError if a method has no scores, or two have theirs by different protocols.
     """
     out = Path(out)
     methods = [_summary(Path(folder)) for folder in scores]
-    tables = [table.by(one_id(methods)) for table in _tables(dataset, methods, scores, seed)]
+    tables = [table.by(one_id(methods)) for table in _tables(dataset, methods, scores)]
     for table in tables:
         table.write(out)
     scorer = Scorer(dataset.disparity_range)
@@ -126,7 +125,7 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 def _tables(
-    dataset: StereoDataset, methods: Sequence[Row], scores: Sequence[str | Path], seed: int
+    dataset: StereoDataset, methods: Sequence[Row], scores: Sequence[str | Path]
 ) -> list[Table]:
     """All tables, those of the paper first."""
     trained = {pair.city for pair in dataset.pairs() if pair.split == "train"}
@@ -136,7 +135,7 @@ def _tables(
         by_city(methods, trained, beside_paper=beside_paper),
         of_fine_tuned(methods, trained, beside_paper=beside_paper),
         by_strata(methods),
-        differences(methods, scores, seed=seed),
+        differences(methods, [[folder] for folder in scores]),
         confidence_table(methods),
         beside_published(methods),
     ]
@@ -180,6 +179,7 @@ def _values(
             if any(shown and shown.groups for _, shown in t.shown)
         ],
         "protocol": one_id(methods),
+        "seal": next((of["seal"] for of in methods), ""),
         "what": minus(dataset_in_words(methods)),
         "slider": _slider(pair),
         "errors": Scale.of(ERRORS, "0", f"{panels.ERROR_PX:g} px; blue: no disparity"),

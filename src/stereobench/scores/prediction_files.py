@@ -2,8 +2,9 @@
 
 A submission is a folder of results as kind ``folder`` takes it, ``<pair>.tif`` and, where the
 method states it, ``<pair>_uncertainty.tif``, with ``submission.json``: protocol id and definition,
-scores, what the method is, on which machine it ran, the checksum of each file. Who takes it as a
-method of kind ``folder`` scores it again: files that were changed since are refused, and so are
+scores (none where the labels are sealed), what the method is, who submits it, its licence, training
+data and seed, on which machine it ran, the checksum of each file. Who takes it as a method of kind
+``folder``, or for a board, scores it again: files that were changed since are refused, and so are
 scores by another protocol, or other ones by the same.
 """
 
@@ -25,13 +26,15 @@ from stereotruth.core.products.provenance import file_sha256
 from stereotruth.core.products.rasters import read_disparity
 from stereotruth.tiles.stereo_dataset import Pair
 
+from .published import training_data
+
 RECORD = "predictions.json"
 UNCERTAINTY = "uncertainty"  # folder of a folder of predictions
 FILE = "submission.json"
 SUBMITTED = "submitted"  # of a record of predictions: the scores that its submission states
 TOLERANCE = 2e-6  # of figures that are rounded to 1e-6
 Figure = int | float | None
-KEPT = ("label", "dataset", "protocol", "identity", "machine", "device", "threads")
+KEPT = ("dataset", "identity", "machine", "device", "threads")
 
 
 def read_record(folder: str | Path) -> dict[str, Any]:
@@ -64,14 +67,20 @@ def read_uncertainty(folder: str | Path, pair: Pair) -> NDArray[np.float32] | No
     return read_disparity(file, np.nan) if file.is_file() else None
 
 
-def pack(predictions: str | Path, scores: str | Path, out: str | Path) -> dict[str, Any]:
+def pack(predictions: str | Path, scores: str | Path | None, out: str | Path) -> dict[str, Any]:
     """Write the submission of a method; returns what ``submission.json`` holds.
 
-    ``predictions``, ``scores``: folders of rules match and score.
+    ``predictions``, ``scores``: folders of rules match and score; no scores of sealed labels.
     """
     predictions = Path(predictions)
-    summary = json.loads((Path(scores) / "scores.json").read_text(encoding="utf-8"))
-    pairs = read_record(predictions)["pairs"]
+    record = read_record(predictions)
+    settings, pairs, scored = record["settings"], record["pairs"], {}
+    label = settings.get("label") or record["method"]
+    if scores is not None:
+        summary = json.loads((Path(scores) / "scores.json").read_text(encoding="utf-8"))
+        label = summary["label"]
+        scored = {"scores": {key: summary[key] for key in ("protocol", "all", "cities", "strata")}}
+    training = training_data(record)
     with atomic_folder(out) as scratch:
         for pair in pairs:
             for name, file in (
@@ -81,8 +90,13 @@ def pack(predictions: str | Path, scores: str | Path, out: str | Path) -> dict[s
                 if file.is_file():
                     shutil.copyfile(file, scratch / name)
         packed = {
-            **{key: summary[key] for key in KEPT},
-            "scores": {key: summary[key] for key in ("protocol", "all", "cities", "strata")},
+            "label": label,
+            "by": settings.get("by", ""),
+            "seed": settings.get("seed"),
+            "licence": training["licence"],
+            "trained_on": training["trained_on"],
+            **{key: record[key] for key in KEPT},
+            **scored,
             "pairs": pairs,
             "files": {file.name: file_sha256(file) for file in sorted(scratch.iterdir())},
         }
@@ -93,11 +107,16 @@ def pack(predictions: str | Path, scores: str | Path, out: str | Path) -> dict[s
 
 @dataclass(frozen=True)
 class Submission:
-    """A folder that :func:`pack` wrote: checksums of its files by name, and its scores."""
+    """A folder as :func:`pack` writes it.
+
+    ``files``: checksums by name; ``scores``: those it states, empty where the labels are sealed;
+    ``facts``: all that ``submission.json`` holds.
+    """
 
     folder: Path
     files: Mapping[str, str]
     scores: Mapping[str, Any]
+    facts: Mapping[str, Any]
 
     @classmethod
     def of(cls, folder: Path) -> Submission | None:
@@ -107,16 +126,17 @@ class Submission:
             return None
         try:
             packed = json.loads(file.read_text(encoding="utf-8"))
-            names, scores = list(packed["files"].keys()), packed["scores"]
-            if wrong := [name for name, of in _figures(scores) if not isinstance(of, Figure)]:
+            names, scores = list(packed["files"].keys()), packed.get("scores") or {}
+            figures = list(_figures(scores)) if scores else []
+            if wrong := [name for name, of in figures if not isinstance(of, Figure)]:
                 raise TypeError(wrong)
-            protocol = scores["protocol"]["id"]
+            protocol = scores["protocol"]["id"] if scores else "none"
         except (ValueError, KeyError, TypeError, AttributeError):
             raise InputError("no submission", file=file, remedy="take the file as it was") from None
         for name in names:
             plain_name(name, "the name of a result,", file)
         plain_name(protocol, "the protocol's id", file)
-        return cls(folder, packed["files"], scores)
+        return cls(folder, packed["files"], scores, packed)
 
     def check(self, files: Iterable[Path]) -> None:
         """Raise InputError unless the files are as they were packed."""

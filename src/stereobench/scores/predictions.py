@@ -118,6 +118,7 @@ def predict(
         }
         ledger.put(pair.name, keys[pair.name], places, took)
         found[pair.name] = took
+    submitted = maker.submission
     record = {
         "dataset": dataset.name,
         "split": split,
@@ -132,7 +133,7 @@ def predict(
         "device": maker.device,
         "threads": workers,
         **_summary(found),
-        **({SUBMITTED: maker.submission.scores} if maker.submission else {}),
+        **({SUBMITTED: submitted.scores} if submitted and submitted.scores else {}),
         "pairs": {pair.name: found[pair.name] for pair in pairs},
     }
     text = json.dumps(record, indent=2) + "\n"
@@ -347,7 +348,7 @@ def _distributions(settings: Mapping[str, Any]) -> list[Distribution]:
         with suppress(InputError):
             place, _ = place_of(settings["function"])
             tops = [] if place.endswith(".py") else [place.partition(".")[0]]
-    names = packages_distributions()
+    names = packages_distributions() if tops else {}  # reads what all packages say of themselves
     return [distribution(names[top][0]) for top in tops if top in names]
 
 

@@ -4,9 +4,10 @@ scores.csv   a row per tile
 cities.csv   a row per city, and one of all, with 95 % confidence intervals, and the median absolute
              error of the valid pixels (``median_px``; what is beyond 16 px counts as 16)
 strata.csv   a row per stratum (see :mod:`.strata`), with confidence intervals
-scores.json  all of it but the tiles, with settings, time and memory, what makes the results
-             doubtful (see :class:`.scores.Doubts`), why rows have no intervals (``no_interval``),
-             and of methods that state uncertainties what :mod:`.confidence` says by stratum
+scores.json  all of it but the tiles, with settings, time and memory, the seal of the labels
+             (:mod:`stereotruth.tiles.seals`), what makes the results doubtful (see
+             :class:`.scores.Doubts`), why rows have no intervals (``no_interval``), and of methods
+             that state uncertainties what :mod:`.confidence` says by stratum
 cumulative.csv  the distribution of errors (see :class:`.scores.Cumulative`)
 sparsification.csv  of such methods: mean errors by the share of pixels taken away
 panels/      pictures of tiles: left, right, truth, disparity, error
@@ -204,6 +205,7 @@ def score(
             "fine_tuned_of": fine_tuned_of,
             **{key: record[key] for key in record if key not in ("pairs", SUBMITTED)},
             "protocol": protocol.identified(sums.scored),
+            "seal": dataset.seal,
             "tiles": len(pairs),
             "thresholds_px": list(protocol.thresholds_px),
             "bootstrap": plan.bootstrap,

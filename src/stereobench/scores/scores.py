@@ -155,7 +155,8 @@ class Scorer:
         filled = error if valid.all() else np.abs(self.filled(disparity)[counted] - label)
 
         def errors(of: Floats) -> list[float]:
-            return [float(of.sum()), *(int((of > limit).sum()) for limit in self.thresholds_px)]
+            total = np.cumsum(of)[-1] if of.size else 0.0  # added in one order on any machine
+            return [float(total), *(int((of > limit).sum()) for limit in self.thresholds_px)]
 
         chosen = {ALL: np.ones(label.size, bool)}
         chosen |= {name: of[counted] for name, of in (strata or {}).items()}

@@ -13,21 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from stereotruth.core.errors import in_number
-from stereotruth.core.products.files import atomic_file, read_table, write_table
+from stereotruth.core.products.files import atomic_file, write_table
 from stereotruth.pages.tables import EMPTY, Cell, Column, metres, minus
 from stereotruth.pages.tables import Table as Shown
 
 from ..methods.kinds import KINDS
 from .published import TABLE5, TABLE6, TABLE7, training_data
 from .published import TRAINING_COLUMNS as TRAINING
-from .scores import CONFIDENCE, MIN_TILES, Floats, resampled
 
 Row = Mapping[str, Any]
 
@@ -379,79 +375,3 @@ def dataset_in_words(methods: Sequence[Row]) -> str:
         f"disparities [{low}, {high}) px."
     )
     return where + more
-
-
-# ------------------------------------------------------------------- methods on the same tiles
-
-
-def difference(
-    first: Mapping[str, Floats], second: Mapping[str, Floats], times: int, seed: int
-) -> dict[str, Any]:
-    """Second less first over the tiles that both have, and its 95 % interval.
-
-    By tile: labelled pixels, and a figure's sum over them. Both are resampled together, so that
-    what is hard in a tile for both cancels. No interval (None) of fewer than ``MIN_TILES`` tiles;
-    ``better_share``: of the tiles on which the second has the smaller figure.
-    """
-    tiles = [name for name in first if name in second]
-    found: dict[str, Any] = dict.fromkeys(("value", "low", "high", "better_share"))
-    if tiles:
-        sums = np.array([[*first[name], *second[name]] for name in tiles])
-
-        def pooled(total: Floats) -> Floats:
-            return total[..., 3] / total[..., 2] - total[..., 1] / total[..., 0]
-
-        found["value"] = float(pooled(sums.sum(axis=0)))
-        found["better_share"] = float((pooled(sums) < 0).mean())
-        if len(tiles) >= MIN_TILES and times:
-            samples = pooled(resampled(sums, times, seed))
-            found["low"], found["high"] = np.percentile(samples, CONFIDENCE).tolist()
-    rounded = {name: None if v is None else round(v, 6) for name, v in found.items()}
-    return {"tiles": len(tiles), **rounded}
-
-
-def differences(methods: Sequence[Row], folders: Sequence[str | Path], *, seed: int) -> Table:
-    """How much methods differ two by two on the same tiles.
-
-    Tiles differ more than methods do, so that intervals of single methods overlap even where one is
-    better on nearly every tile. ``folders``: of the methods, with ``scores.csv``; intervals come
-    from as many samples as those of the first method.
-    """
-    title = "Differences: method by method on the same tiles"
-    if len(methods) < 2:
-        return Table("differences", title, [], [("One method alone.", None)])
-    limit = methods[0]["thresholds_px"][0]
-    names = {"epe_px": "filled_epe_px", "d1_share": f"filled_d1_{limit:g}_px_share"}
-    tables = [
-        [row for row in read_table(Path(folder) / "scores.csv") if int(row["labelled"])]
-        for folder in folders
-    ]
-    sums = [
-        {
-            key: {row["tile"]: int(row["labelled"]) * np.array([1, float(row[name])]) for row in of}
-            for key, name in names.items()
-        }
-        for of in tables
-    ]
-    rows = []
-    for a, b in combinations(range(len(methods)), 2):
-        row: dict[str, Any] = {"method": methods[b]["label"], "less": methods[a]["label"]}
-        for key in names:
-            found = difference(sums[a][key], sums[b][key], methods[0]["bootstrap"], seed)
-            row |= {"tiles": found["tiles"], key: found["value"]}
-            row |= {f"{key}_{end}": found[end] for end in ("low", "high", "better_share")}
-        rows.append(row)
-    better = "better on (% of tiles)"
-    figures = [
-        Figure("EPE (px)", "epe_px", 1, "+.3f", interval=True),
-        Figure(better, "epe_px_better_share", 100, ".0f"),
-        Figure(f"D1, {limit:g} px (%)", "d1_share", 100, "+.2f", interval=True),
-        Figure(better, "d1_share_better_share", 100, ".0f"),
-    ]
-    named = [{"name": f"{row['method']} minus {row['less']}", **row} for row in rows]
-    caption = (
-        f"Difference of {FILLED}, with 95 % confidence by resampling the tiles of both methods "
-        "together: negative where the first of the two is better."
-    )
-    shown = of_figures(named, {"name": "Methods"}, figures)
-    return Table("differences", title, rows, [(caption, shown)])

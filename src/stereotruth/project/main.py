@@ -14,8 +14,8 @@ import typer
 
 from .. import __version__
 from ..core.errors import InputError, told_by_system
-from .dataset_commands import app as dataset_commands
-from .dataset_commands import examples
+from .judge import app as judge_app
+from .judge import examples
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
@@ -38,7 +38,6 @@ scene_app = typer.Typer(no_args_is_help=True, help="The scenes of the project.")
 gcps_app = typer.Typer(no_args_is_help=True, help="Ground control points.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(gcps_app, name="gcps")
-app.add_typer(dataset_commands)
 Configured = Annotated[
     list[Path] | None,
     typer.Option("--configfile", help="Read this instead of config.yaml; may be given again."),
@@ -412,49 +411,7 @@ def status(
     show_status(cities or [], configfile)
 
 
-@app.command(
-    "score-dsm",
-    epilog=examples(
-        "stereotruth score-dsm dsm.tif --lidar /data/lidar --to verdict",
-        "stereotruth score-dsm dsm.tif --reference truth.tif --to verdict",
-        "stereotruth score-dsm dsm.tif --geoid egm08_25.gtx --lidar 'tiles/*.laz' --to verdict",
-    ),
-)
-def score_surface_model(
-    model: Annotated[Path, typer.Argument(help="GeoTIFF of heights, north-up, in metres.")],
-    to: Annotated[Path, typer.Option(help="Folder to be written: scores.json, index.html.")],
-    lidar: Annotated[
-        str, typer.Option(help="Folder, glob or files of LAS, LAZ, COPC, or GeoTIFFs of heights.")
-    ] = "",
-    reference: Annotated[Path | None, typer.Option(help="Raster of true heights.")] = None,
-    geoid: Annotated[
-        Path | None, typer.Option(help="Geoid grid, if the model's heights are orthometric.")
-    ] = None,
-    lidar_crs: Annotated[str, typer.Option(help="For LiDAR files that declare none.")] = "",
-    reference_geoid: Annotated[
-        Path | None, typer.Option(help="Geoid grid, if the reference's heights are orthometric.")
-    ] = None,
-    reference_classes: Annotated[
-        Path | None, typer.Option(help="LAS classes on the grid of the reference raster.")
-    ] = None,
-    epoch: Annotated[str, typer.Option(help="Of the model's images, 2016.4 or a date.")] = "",
-) -> None:
-    """Judge any surface model: where it lies, its heights by surface and slope, edges of roofs."""
-    from .score_dsm import score_dsm
-
-    typer.echo(
-        score_dsm(
-            model,
-            to,
-            lidar=lidar,
-            reference=reference,
-            geoid=geoid,
-            lidar_crs=lidar_crs,
-            reference_geoid=reference_geoid,
-            reference_classes=reference_classes,
-            epoch=epoch,
-        )
-    )
+app.add_typer(judge_app)
 
 
 @app.command("open", epilog=examples("stereotruth open", "stereotruth open Marseille"))

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,12 +29,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
+from ..core.errors import InputError, in_number
 from ..core.products.files import files_below, plain_name, read_sealed
 from ..core.products.provenance import file_sha256
 from ..core.products.rasters import read_disparity, read_image, read_labels
 from .manifest import NO_TRUTH, NONE, PATHS, SPLITS, SUM, manifest_rows
 from .manifest import column as column_of
+from .seals import Seal
 
 LAYOUTS = ("stereotruth", "whu", "kitti", "us3d")
 LEFT_NAMES = {"us3d": "*_LEFT_RGB.tif", "kitti": "image_2/*_10.png"}
@@ -60,7 +61,7 @@ class Pair:
     """A stereo pair: ``name`` is unique in its dataset; ``disparity`` is None without labels.
 
     ``split`` is train, val, test or none. ``row`` is the pair's line of the manifest of layout
-    ``stereotruth``, else empty.
+    ``stereotruth``, else empty. ``sealed``: checksum of labels that were sealed (:mod:`.seals`).
     """
 
     name: str
@@ -70,6 +71,7 @@ class Pair:
     right: Path
     disparity: Path | None
     row: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
+    sealed: str = field(default="", repr=False, compare=False)
 
     def refuse_changed(self) -> None:
         """Raise InputError if a file is not the one that the manifest has the checksum of."""
@@ -83,6 +85,12 @@ class Pair:
                     remedy="get or make the dataset again; or delete the manifest, if the edit "
                     "was yours",
                 )
+        if self.sealed and self.disparity and file_sha256(self.disparity) != self.sealed:
+            raise InputError(
+                "is not the label that was sealed",
+                file=self.disparity,
+                remedy="open the seal again with the labels that it was made of",
+            )
 
 
 @dataclass(frozen=True)
@@ -117,9 +125,16 @@ class StereoDataset:
     def pairs(self, split: str | None = None, *, labelled: bool = False) -> list[Pair]:
         """The pairs of a split (None: all), only those with labels if ``labelled``.
 
-        Raises InputError if there are none.
+        Raises InputError if there are none, or labels that are wanted are still sealed.
         """
         found = find_pairs(self.root, self.layout)
+        shut = [p for p in found if p.sealed and p.disparity is None and split in (None, p.split)]
+        if labelled and shut:
+            raise InputError(
+                f"labels of {in_number(len(shut), 'pair')} of split {shut[0].split!r} are sealed",
+                file=self.root,
+                remedy="wait until they are opened, or open them: stereotruth dataset --open",
+            )
         chosen = [
             pair
             for pair in found
@@ -134,6 +149,12 @@ class StereoDataset:
                 remedy="take another split, or another root",
             )
         return chosen
+
+    @property
+    def seal(self) -> str:
+        """The id of the seal that its labels were published under; empty of none."""
+        seal = Seal.of(self.root)
+        return seal.id if seal else ""
 
     def labels(self, pair: Pair) -> NDArray[np.float32]:
         """Disparity of a labelled pair, float32[h, w] px; NaN unlabelled."""
@@ -212,10 +233,11 @@ def find_pairs(root: str | Path, layout: str) -> list[Pair]:
         )
     if not root.is_dir():
         raise InputError("no such folder", file=root, remedy="name the root of the dataset")
+    seal = Seal.of(root)
     if layout in ("us3d", "kitti"):
         found = list({"us3d": _us3d, "kitti": _kitti}[layout](root))
     elif layout == "stereotruth" and (root / "manifest.csv").is_file():
-        found = list(_of_manifest(root))
+        found = list(_of_manifest(root, seal.files if seal else ()))
     else:
         found = list(_whu(root))
     if not found:
@@ -226,7 +248,11 @@ def find_pairs(root: str | Path, layout: str) -> list[Pair]:
             file=root,
             remedy=f"name the root of the dataset, or take layout {' or '.join(others)}",
         )
-    return sorted(_unique(found, root), key=lambda pair: (pair.split, natural(pair.name)))
+    named = list(_unique(found, root))
+    if seal:
+        sums = {name: seal.files[path] for name, path in seal.pairs.items()}
+        named = [replace(pair, sealed=sums.get(pair.name, "")) for pair in named]
+    return sorted(named, key=lambda pair: (pair.split, natural(pair.name)))
 
 
 def natural(name: str) -> list[tuple[int, str]]:
@@ -240,7 +266,8 @@ def match_inside(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
     return (match >= 0) & (match <= disparity.shape[1] - 1)
 
 
-def _of_manifest(root: Path) -> Iterator[Pair]:
+def _of_manifest(root: Path, sealed: Collection[str]) -> Iterator[Pair]:
+    """``sealed``: paths of files that may be held back (:mod:`.seals`)."""
     known = root / "export.json"  # of a folder of tiles
     sums = read_sealed(known) if known.is_file() else {}
     if sums.get("manifest_sha256") not in (None, file_sha256(root / "manifest.csv")):
@@ -252,7 +279,9 @@ def _of_manifest(root: Path) -> Iterator[Pair]:
     for row in manifest_rows(root / "manifest.csv"):
         try:
             split = row["split"] if row["disp"] else NONE
-            files = [root / row[kind] if row[kind] else None for kind in ("left", "right", "disp")]
+            files = [root / row[kind] if row[kind] else None for kind in PATHS]
+            if row["disp"] in sealed and not files[2].is_file():
+                files[2] = None
             name, city = row["tile"], row["city"]
         except KeyError as error:
             raise InputError(

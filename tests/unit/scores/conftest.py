@@ -48,6 +48,5 @@ def compared(tmp_path_factory):
         [folder / "benchmark" / name for name in methods],
         [folder / "match" / name for name in methods],
         folder / "compared",
-        seed=1,
     )
     return folder

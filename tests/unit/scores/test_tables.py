@@ -1,15 +1,11 @@
-"""Tables in the form of the paper, and of methods on the same tiles."""
+"""Tables in the form of the paper."""
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
-
-import numpy as np
 import pytest
 
 from stereobench.scores.published import TABLE7, training_data
-from stereobench.scores.tables import by_city, difference, differences, of_fine_tuned, of_methods
+from stereobench.scores.tables import by_city, of_fine_tuned, of_methods
 
 from ...synthetic.toy_benchmark import rows, texts, titles
 
@@ -109,55 +105,6 @@ def test_the_paper_s_figures_stand_apart_and_groups_are_pooled_by_pixels(tmp_pat
     seven.write(tmp_path)
     assert "fine_tuned_of" in (tmp_path / "fine_tuned.md").read_text()
     assert (tmp_path / "fine_tuned.csv").read_text() == "method\n"
-
-
-FIELDS = ["tile", "labelled", "filled_epe_px", "filled_d1_3_px_share"]
-
-
-def folder(path: Path, rows: list[tuple]) -> Path:
-    path.mkdir()
-    with (path / "scores.csv").open("w", newline="") as stream:
-        csv.writer(stream).writerows([FIELDS, *rows])
-    return path
-
-
-def of(name: str) -> dict:
-    return {"label": name, "thresholds_px": [3.0], "bootstrap": 500}
-
-
-@pytest.fixture
-def folders(tmp_path: Path) -> list[Path]:
-    """Tiles from 1 to 8 px hard; the second method is 0.1 to 0.3 px better on all but one."""
-    rng = np.random.default_rng(3)
-    hard = np.linspace(1, 8, 12)
-    gain = rng.uniform(0.1, 0.3, 12)
-    gain[4] = -0.1
-    first = [(f"T_{n}", 1000, e, e / 10) for n, e in enumerate(hard)]
-    second = [(f"T_{n}", 1000, e - g, e / 10) for n, (e, g) in enumerate(zip(hard, gain))]
-    empty = ("T_empty", 0, "", "")
-    return [folder(tmp_path / "a", [*first, empty]), folder(tmp_path / "b", [*second, empty])]
-
-
-def test_a_small_gain_on_hard_and_easy_tiles_is_told(folders: list[Path]) -> None:
-    table = differences([of("A"), of("B")], folders, seed=1)
-    (row,) = table.rows
-    assert (row["method"], row["less"], row["tiles"]) == ("B", "A", 12)
-    assert -0.3 < row["epe_px_low"] < row["epe_px"] < row["epe_px_high"] < 0
-    assert row["epe_px_better_share"] == pytest.approx(11 / 12, abs=1e-6)
-    assert row["d1_share"] == row["d1_share_low"] == row["d1_share_high"] == 0
-    assert row["d1_share_better_share"] == 0
-    assert "| B minus A | −0.1" in table.markdown() and "| 92 | +0.00 [" in table.markdown()
-    assert differences([of("A"), of("B")], folders, seed=1) == table
-
-
-def test_tiles_count_by_their_pixels() -> None:
-    first = {"a": np.array([10.0, 10]), "b": np.array([90.0, 90])}
-    second = {"b": np.array([90.0, 180]), "a": np.array([10.0, 0]), "c": np.array([5.0, 5])}
-    found = difference(first, second, 100, 1)
-    assert found["tiles"] == 2 and found["better_share"] == 0.5
-    assert found["value"] == pytest.approx((180 - 100) / 100)
-    assert found["low"] is None  # two tiles are too few
-    assert difference(first, {}, 100, 1)["value"] is None
 
 
 @pytest.mark.parametrize(

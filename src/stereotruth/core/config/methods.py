@@ -203,6 +203,13 @@ class Method(Section):
     trained_on: Annotated[tuple[Text, ...], Unit("names")] = ()
     """datasets that the method was trained on, named as in `benchmark.datasets`, for tables"""
 
+    seed: Annotated[Whole | None, Unit("whole number")] = None
+    """of the training; methods of one label whose seeds differ are runs of one method on a
+    [board](../docs/how-to/board.md)"""
+
+    by: Text = ""
+    """who submits its results to a [board](../docs/how-to/board.md)"""
+
     training: Annotated[dict[str, Any], AfterValidator(_part_of_training)] = Field(
         default_factory=dict
     )

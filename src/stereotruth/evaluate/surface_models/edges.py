@@ -13,6 +13,10 @@ profiles:
 with s in m outward along the normal, q the model's share of the step and q₀ the sharp edge's.
 A roof drawn 1 m too wide has 1 and +1; an edge that is blurred to both sides with a standard
 deviation of 1 m has 0.56 and 0. Vertical noise below a tenth of the step has no say.
+
+The resolution is what is left of the error when the sharp edge is moved, profile by profile, to
+where the model has it: as the width at half maximum of the Gaussian spread that leaves as much, so
+that an edge in a wrong place is as well resolved as one in the right place.
 """
 
 from __future__ import annotations
@@ -50,6 +54,10 @@ TOGETHER = 2000  # edges
 S = np.arange(-REACH_M + STEP_M / 2, REACH_M, STEP_M)  # m
 SHARP = (S < 0).astype(np.float64)
 POSITIONS = Scale((1.0,), 0.01, 801)  # m, to ±4
+# Width at half maximum, 2.3548 σ, over the area between a Gaussian's edge and a sharp one at its
+# place, both between LOW and HIGH: 2 / 0.8 ∫ (Φ(−s) − 0.1) ds from 0 to 1.2816 σ = 0.5586 σ.
+WIDTH_OF_AREA = 2.3548 / 0.5586
+WIDTHS = Scale((1.0,), 0.02, 1001)  # m, to 10
 
 
 @dataclass(frozen=True)
@@ -163,12 +171,13 @@ def _lines(lattice: Lattice, i: NDArray, j: NDArray, classified: bool) -> Edges:
 class Profiles:
     """What a model has at edges [n]: position error and its outward part (m, NaN if unknown).
 
-    ``measured``: with heights around; ``found``: of them, with a step in the model. ``share``
-    [n, along, s]: of the step, NaN unknown.
+    ``resolution``: width of the spread at half maximum, m. ``measured``: with heights around;
+    ``found``: of them, with a step in the model. ``share`` [n, along, s]: of the step, NaN unknown.
     """
 
     error: Floats
     outward: Floats
+    resolution: Floats
     measured: NDArray[np.bool_]
     found: NDArray[np.bool_]
     share: Floats
@@ -214,9 +223,14 @@ def measure(
         found = measured & (inner - outer > LEAST_RISE)
         off = q - SHARP
         error = np.nanmean(np.where(whole, np.nansum(np.abs(off), axis=2), np.nan), axis=1)
-        outward = np.nanmean(np.where(whole, np.nansum(off, axis=2), np.nan), axis=1)
-    error, outward = (np.where(found, STEP_M * v, np.nan) for v in (error, outward))
-    return Profiles(error, outward, measured, found, q)
+        moved = np.where(whole, np.nansum(off, axis=2), np.nan)  # steps, of each profile
+        outward = np.nanmean(moved, axis=1)
+        sharp = np.clip(moved[..., None] - S / STEP_M + 0.5, 0.0, 1.0)  # at the model's place
+        between = np.nansum(q + sharp - 2 * q * sharp, axis=2)  # |q - q₀|, of a step within a bin
+        spread = np.nanmean(np.where(whole, between, np.nan), axis=1)
+    spread *= WIDTH_OF_AREA
+    values = (np.where(found, STEP_M * v, np.nan) for v in (error, outward, spread))
+    return Profiles(*values, measured, found, q)
 
 
 @dataclass
@@ -226,6 +240,7 @@ class EdgeErrors:
     edges: int = 0
     measured: int = 0  # with heights around
     errors: ErrorSum = field(default_factory=lambda: ErrorSum(POSITIONS))  # where a step is found
+    widths: ErrorSum = field(default_factory=lambda: ErrorSum(WIDTHS))  # likewise
     outward: float = 0.0
     profile: Floats = field(default_factory=lambda: np.zeros(S.size))
     profiles: NDArray[np.int64] = field(default_factory=lambda: np.zeros(S.size, np.int64))
@@ -235,6 +250,7 @@ class EdgeErrors:
         self.edges += seen.found.size
         self.measured += int(seen.measured.sum())
         self.errors.add(seen.error[seen.found])
+        self.widths.add(seen.resolution[seen.found])
         self.outward += float(seen.outward[seen.found].sum())
         share = seen.share[seen.found]
         self.profile += np.nansum(share, axis=(0, 1))
@@ -242,14 +258,16 @@ class EdgeErrors:
 
     def figures(self) -> dict[str, float | int | None]:
         """JSON-ready; m. ``measured_share``: of the reference's edges, those with heights around;
-        ``missing_share``: of these, those where the model has no step. All else is of the rest.
+        ``missing_share``: of these, those where the model has no step. All else is of the rest;
+        ``resolution_m``: that of half of them, at best.
         """
         n = self.errors.count
         shares = {
             "measured_share": self.measured / self.edges if self.edges else None,
             "missing_share": 1 - n / self.measured if self.measured else None,
         }
-        lacking = dict.fromkeys(("position_error_m", "median_m", "p90_m", "outward_m"))
+        names = ("position_error_m", "median_m", "p90_m", "outward_m", "resolution_m")
+        lacking = dict.fromkeys(names)
         if not n:
             return {"edges": self.edges, **shares, **lacking}
         values = {
@@ -258,6 +276,7 @@ class EdgeErrors:
             "median_m": self.errors.quantile_of_size(0.5),
             "p90_m": self.errors.quantile_of_size(0.9),
             "outward_m": self.outward / n,
+            "resolution_m": self.widths.quantile_of_size(0.5),
         }
         return {"edges": self.edges} | {name: round(v, 4) for name, v in values.items()}
 

@@ -75,6 +75,7 @@ STEPS = "beside steps and trees"
 BLOCK = 512  # cells of a window
 PARTS = 48  # windows that the registration sees, about
 AROUND_M = REACH_M + 2.0  # of a window, for what is said of its points
+TILES_A_DEGREE = 1000  # of the table of tiles, in which models of other grids compare
 MAP_SIDE = 700  # squares of the map of differences at most
 
 # The page.
@@ -114,6 +115,34 @@ class HeightErrors:
             **shares,
         }
         return {"points": self.points} | {k: round(float(v), 4) for k, v in values.items()}
+
+
+@dataclass
+class TileSums:
+    """Errors by tile of the ground, TILES_A_DEGREE: counts, sums of sizes in m."""
+
+    sums: dict[tuple[int, int], Floats] = field(default_factory=dict)
+
+    def add(self, model: HeightRaster, x: Floats, y: Floats, column: int, *errors: Floats) -> None:
+        """Add errors [n] at places (m, of the model): count, then sums, from a column on."""
+        lon, lat, _ = model.to_wgs84.exact(*model.coordinates(x, y), np.zeros(x.size))
+        places = np.floor(TILES_A_DEGREE * np.stack([lat, lon])).astype(np.int64)
+        names, of = np.unique(places, axis=1, return_inverse=True)
+        for k, values in enumerate((np.ones(x.size), *map(np.abs, errors))):
+            for name, total in zip(names.T.tolist(), np.bincount(of.ravel(), values)):
+                self.sums.setdefault(tuple(name), np.zeros(5))[column + k] += total
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of ``tiles.csv``, from south to north; a tile is named by its south-west corner."""
+        rows = []
+        for south, west in sorted(self.sums):
+            points, height, edges, place, width = self.sums[south, west].tolist()
+            row = {"tile": f"{south / TILES_A_DEGREE:.3f} {west / TILES_A_DEGREE:.3f}"}
+            row |= {"points": int(points), "mean_absolute_m": height / points if points else None}
+            row |= {"edges": int(edges), "position_error_m": place / edges if edges else None}
+            row |= {"resolution_m": width / edges if edges else None}
+            rows.append({k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()})
+        return rows
 
 
 def slopes(lattice: Lattice) -> Floats:
@@ -161,6 +190,7 @@ class Verdict:
 
     ``delivered``: errors as the model comes, by stratum; ``registered``: after the shift is taken
     out. ``differences`` float32[h, w]: mean of model less reference (m), registered, for the map.
+    ``tiles``: heights off steps and edges by tile of the ground, registered.
     """
 
     model: HeightRaster
@@ -170,6 +200,7 @@ class Verdict:
     registered: dict[str, HeightErrors]
     edges: EdgeErrors
     differences: Floats
+    tiles: TileSums
 
     def figures(self) -> dict[str, Any]:
         """JSON-ready; m."""
@@ -241,7 +272,7 @@ def score_surface_model(
         "%s: %.2f m east, %.2f m north, %.2f m up of its reference",
         model.path.name, found.east_m, found.north_m, found.up_m,
     )  # fmt: skip
-    delivered, edges = HeightErrors(), EdgeErrors()
+    delivered, edges, tiles = HeightErrors(), EdgeErrors(), TileSums()
     registered: dict[str, HeightErrors] = {}
     coarse = max(1, -(-max(model.shape) // MAP_SIDE))
     sums = np.zeros((2, -(-model.shape[0] // coarse), -(-model.shape[1] // coarse)))
@@ -262,7 +293,12 @@ def score_surface_model(
             registered.setdefault(name, HeightErrors()).add(error[squares])
         solid = chosen[SOLID]
         delivered.add(heights.at(lattice.x[solid], lattice.y[solid]) - lattice.z[solid])
-        edges.add(measure(find_edges(lattice, reference.classified), height_at))
+        lines = find_edges(lattice, reference.classified)
+        seen = measure(lines, height_at)
+        edges.add(seen)
+        at, known = seen.found, chosen[OPEN] & np.isfinite(error)
+        tiles.add(model, lines.x[at], lines.y[at], 2, seen.error[at], seen.resolution[at])
+        tiles.add(model, lattice.x[known], lattice.y[known], 0, error[known])
         known = lattice.own & np.isfinite(error)
         dx, dy = model.cell_m
         at = tuple(
@@ -273,7 +309,7 @@ def score_surface_model(
         np.add.at(sums[1], at, 1.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         differences = (sums[0] / sums[1]).astype(np.float32)
-    return Verdict(model, reference, found, delivered, registered, edges, differences)
+    return Verdict(model, reference, found, delivered, registered, edges, differences, tiles)
 
 
 # ----------------------------------------------------------------------------------------- the page
@@ -289,6 +325,7 @@ def describe(figures: dict[str, Any]) -> str:
     )
     if edges["position_error_m"] is not None:
         text += f"; edges of roofs {edges['position_error_m']:.2f} m off"
+        text += f", {edges['resolution_m']:.2f} m resolved"
     return minus(text)
 
 
@@ -305,6 +342,7 @@ def write_verdict(
     with atomic_folder(folder) as scratch:
         write_json(scratch / "scores.json", figures)
         write_table(scratch / "errors.csv", rows)
+        write_table(scratch / "tiles.csv", verdict.tiles.rows())
         values = _values(verdict, figures, rows)
         values |= {"title": title, "index": way(Path(folder) / "index.html", index)}
         write_page(scratch / "index.html", TEMPLATE, values)
@@ -345,7 +383,7 @@ def _values(
     picture = colours(verdict.differences, (-limit, limit), DIFFERENCES)
     return {
         "figures": figures,
-        "links": [(name, name, "") for name in ("scores.json", "errors.csv")],
+        "links": [(name, name, "") for name in ("scores.json", "errors.csv", "tiles.csv")],
         "registration": _registration(figures["registration"]),
         "edges": figures["edges"],
         "table": table([texts(row) for row in rows]),

@@ -9,10 +9,17 @@ from rasterio.transform import from_origin
 from rasterio.warp import reproject
 from scipy.ndimage import gaussian_filter
 
+from stereobench.scores.paired import compare_folders
 from stereotruth.core.errors import InputError
 from stereotruth.evaluate.surface_models import score
 from stereotruth.evaluate.surface_models.reference import RasterReference
-from stereotruth.evaluate.surface_models.score import OPEN, SOLID, HeightErrors, score_surface_model
+from stereotruth.evaluate.surface_models.score import (
+    OPEN,
+    SOLID,
+    HeightErrors,
+    score_surface_model,
+    write_verdict,
+)
 
 from ....synthetic.analytic_town import (
     CELL_M,
@@ -25,6 +32,7 @@ from ....synthetic.analytic_town import (
     Town,
     write,
 )
+from ....synthetic.exact_surface import write_heights
 
 TOWN = Town(trees=True)
 SHIFT = (2.37, -1.41, 0.83)
@@ -73,6 +81,7 @@ def test_an_exact_model_lies_where_it_is_and_has_the_points_noise(exact):
     assert 0.05 < exact["edges"]["position_error_m"] < 0.25
     assert abs(exact["edges"]["outward_m"]) < 0.05
     assert exact["edges"]["missing_share"] == 0
+    assert exact["edges"]["resolution_m"] == pytest.approx(CELL_M, abs=0.1)
 
 
 @pytest.mark.slow
@@ -90,6 +99,7 @@ def test_a_planted_shift_a_tilt_and_wide_roofs_are_told_apart(judge):
     assert abs(moved["tilt_north_m_per_km"]) < 0.2
     assert found["as_delivered"]["mean_absolute_m"] > 0.8
     assert found["edges"]["outward_m"] == pytest.approx(1.0, abs=0.1)
+    assert found["edges"]["resolution_m"] == pytest.approx(CELL_M, abs=0.1)
 
 
 @pytest.mark.slow
@@ -111,7 +121,26 @@ def test_a_blur_shows_at_the_edges_and_hardly_elsewhere(judge, exact):
     assert abs(found["edges"]["outward_m"]) < 0.05
     more = found["edges"]["position_error_m"] - exact["edges"]["position_error_m"]
     assert more > 5 * abs(off(found) - off(exact))
+    assert found["edges"]["resolution_m"] == pytest.approx(np.hypot(2.3548, CELL_M), abs=0.1)
     assert abs(found["registration"]["east_m"]) < 0.05
+
+
+@pytest.mark.slow
+def test_models_of_other_grids_compare_by_tiles_of_the_ground(points, tmp_path):
+    """A model against itself a row and a column further is level; a blurred one is not."""
+    heights = TOWN.heights()
+    folders = {}
+    for name, of in (
+        ("exact", heights), ("cut", heights[20:, 30:]), ("blurred", gaussian_filter(heights, 2)),
+    ):  # fmt: skip
+        west, north = (WEST + 15, NORTH - 10) if name == "cut" else (WEST, NORTH)
+        model = write_heights(tmp_path / f"{name}.tif", of, west, north, CELL_M, EPSG)
+        folders[name] = tmp_path / name
+        write_verdict(score_surface_model(model, points), folders[name], name)
+    level = compare_folders([folders["exact"]], [folders["cut"]])
+    told = compare_folders([folders["exact"]], [folders["blurred"]])
+    assert [": level" in line for line in level] == [True, True, True]
+    assert [": worse" in line for line in told[1:]] == [True, True]
 
 
 def test_lost_roofs_are_missing_edges_and_bare_trees_stand_apart(judge, exact):
