@@ -12,6 +12,7 @@
 # make test-s3        set up, then pass the tests with object storage (a server of its own)
 # make docs           set up, then build the documentation: docs/_build/html/index.html
 # make networks       set up with PyTorch
+# make wheel          set up, then build the wheel with compiled kernels, so that its first run compiles nothing: dist/
 # make lint           format, lint, lock file
 # make lock           resolve the pins again
 # make clean          remove all that runs have made
@@ -24,7 +25,7 @@ AT_ONCE := $(shell expr $(CORES) + 1)  # short tests: some wait for a server or 
 # Many processes run the same modules: each would compile anew what nobody may keep compiled.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup first-run first-city first-labels help docs networks test test-all test-slow test-networks test-pythons test-s3 test-cluster lint lock dataset verify clean FORCE
+.PHONY: setup first-run first-city first-labels help docs networks wheel test test-all test-slow test-networks test-pythons test-s3 test-cluster lint lock dataset verify clean FORCE
 
 setup: $(READY)
 
@@ -53,6 +54,13 @@ first-labels:
 first-city:
 	rm -rf .venv/first && PATH="$(CURDIR)/$(BIN):$$PATH" && stereotruth init .venv/first --example demo && \
 	  cd .venv/first && stereotruth run tiles/Demo --cores $(CORES) --quiet && cd ../.. && rm -rf .venv/first
+
+# Kernels of a run of the smallest city and of its page, compiled apart from those of .venv.
+wheel: $(READY)
+	rm -rf build dist
+	export NUMBA_CACHE_DIR="$(CURDIR)/build/cache" PATH="$(CURDIR)/$(BIN):$$PATH" && \
+	  stereotruth init build/first --example demo && (cd build/first && stereotruth run tiles/Demo report --cores $(CORES) --quiet)
+	STEREOTRUTH_KERNELS=build/cache/kernels $(PIP) wheel --no-deps --no-build-isolation --wheel-dir dist .
 
 tiles/%: $(READY) FORCE
 	PATH="$(CURDIR)/$(BIN):$$PATH" snakemake --cores $(CORES) $@

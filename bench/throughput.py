@@ -21,13 +21,17 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import laspy
+import numpy as np
 from figures import print_records
 from kernel_rates import CITY, fastest, kernels, show_kernels
+from rasterio.windows import Window
+from synthetic_pairs import rectify_by
 
 import stereotruth
 from stereocities.cities import CITIES, lidar_files
@@ -35,13 +39,17 @@ from stereocities.lidar import simulate_lidar_tile
 from stereocities.render import simulate_image
 from stereotruth.align.adjustment import epipolar_model
 from stereotruth.align.align import align
+from stereotruth.align.alignment import Alignment
 from stereotruth.core.config.configuration import LabelSettings
 from stereotruth.core.products.provenance import source_digest
+from stereotruth.core.products.rasters import open_raster
+from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.epipolar.rectify import rectify
 from stereotruth.labels.project import project_scene
 from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
 from stereotruth.sensor.images import open_pair
+from stereotruth.sensor.rpc import SensorModel
 
 PROJECT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(stereotruth.__file__).parent
@@ -79,6 +87,20 @@ points, settings = json.loads(points), LabelSettings(**json.loads(settings))
 inputs = SceneInputs.of(left, right, points, settings, alignment=alignment, surface=surface)
 with job(log, "project"):
     project_scene(inputs, out, **json.loads(options))
+"""
+STRIP_JOB = """
+import json, sys
+from stereotruth.core.job import job
+from stereotruth.core.products.grids import Strip
+from stereotruth.lidar.point_store import open_stores
+from stereotruth.sensor.pair_geometry import GroundOfImages
+from stereotruth.surface.make_surface import make_surface
+from stereotruth.surface.scale import ground_cell
+image, points, out, log, strip = sys.argv[1:]
+with job(log, "surface"):
+    ground, strip = GroundOfImages.open([image]), Strip.parse(strip) if strip else None
+    cell = ground_cell(ground.pixel_deg)
+    make_surface(open_stores(json.loads(points)), out, cell=cell, ground=ground, strip=strip)
 """
 
 # ------------------------------------------------------------------ data
@@ -366,6 +388,84 @@ def show_chain(report: Mapping[str, Any]) -> None:
         )
 
 
+# ------------------------------------------------------------------ growth
+
+
+def cut(folder: Path, number: int) -> Path:
+    """A folder with a quarter of the scene's left image, rectified with all of the right one."""
+    made = folder / "growth" / f"quarter {number}"
+    made.mkdir(parents=True)
+    alignment = Alignment.read(folder / "alignment.json")
+    with open_raster(folder / "left.tif") as source:
+        size = source.width // 2, source.height // 2
+        first = number % 2 * size[0], number // 2 * size[1]
+        pixels = source.read(1, window=Window(*first, *size))
+        profile, rpcs = source.profile, source.rpcs
+    rpcs.samp_off, rpcs.line_off = rpcs.samp_off - first[0], rpcs.line_off - first[1]
+    profile |= {"width": size[0], "height": size[1]}
+    with open_raster(made / "left.tif", "w", **profile, rpcs=rpcs) as target:
+        target.write(pixels, 1)
+    affine = alignment.left.affine - [[0.0, 0.0, first[0]], [0.0, 0.0, first[1]]]
+    fit = replace(alignment.left_fit, size=size, affine=affine, gcps=())
+    left = SensorModel(alignment.left.rpc, affine)
+    images = made / "left.tif", folder / "right.tif"
+    rectify_by(replace(alignment, left=left, left_fit=fit), images, made)
+    return made
+
+
+def growth(folder: Path, stores: Sequence[Path], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """CPU seconds of `surface` and `project` for the scene, and for its quarters one by one.
+
+    Quarters have the content of the whole, and more margins. `project` takes the whole surface in
+    all of them, so that a list that is gone through too often shows; and `surface` in two strips.
+    """
+    env, points = environment(folder), json.dumps(list(map(str, stores)))
+    told = json.dumps(dict(settings)), json.dumps({"code": "growth"})
+    shutil.rmtree(folder / "growth", ignore_errors=True)
+    quarters = [cut(folder, number) for number in range(4)]
+
+    start = fastest(lambda: job("import stereotruth.labels.project", env=env), 3)[1]
+
+    def spent(code: str, *arguments: object) -> float:
+        return round(fastest(lambda: job(code, *arguments, env=env), 1)[1] - start, 2)
+
+    def surface(name: str, image: Path, strip: str = "") -> float:
+        made = folder / "growth" / name / "s.surface"
+        return spent(STRIP_JOB, image, points, made, folder / "growth.log", strip)
+
+    def project(place: Path) -> float:
+        made = folder / "growth" / f"labels of {place.name}"
+        shutil.rmtree(made, ignore_errors=True)
+        made.mkdir()
+        (made / "s.surface").symlink_to(folder / "growth" / "whole" / "s.surface")
+        rectified, log = (place / "left.zarr", place / "right.zarr"), folder / "growth.log"
+        out, alignment = made / "disparity.zarr", place / "alignment.json"
+        return spent(PROJECT_JOB, *rectified, points, out, log, alignment, *told)
+
+    def megapixels(place: Path) -> float:
+        return float(np.prod(EpipolarModel.load(place / "epipolar.json").shape)) / 1e6
+
+    surface("compiled", quarters[0] / "left.tif")
+    whole = surface("whole", folder / "left.tif")
+    parts = [surface(place.name, place / "left.tif") for place in quarters]
+    strips = [surface("strips", folder / "left.tif", strip) for strip in ("0-of-2", "1-of-2", "")]
+    found = {
+        "surface, s: whole, quarters": (whole, parts),
+        "surface, s: two strips, their joining": strips,
+        "surface, a megapixel, whole / quarters": whole / sum(parts),
+        "surface, the longer of two strips / one job": max(strips[:2]) / whole,
+    }
+    print(json.dumps(found, indent=1), flush=True)
+    project(quarters[0])  # compiles
+    labels, of_quarters = project(folder), [project(place) for place in quarters]
+    sizes = megapixels(folder), sum(map(megapixels, quarters))
+    return {
+        "Mpx: whole, quarters": sizes,
+        "project, s: whole, quarters": (labels, of_quarters),
+        "project, a megapixel, whole / quarters": labels / sizes[0] * sizes[1] / sum(of_quarters),
+    }
+
+
 # ------------------------------------------------------------------ the command
 
 
@@ -385,6 +485,7 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2, help="cores to use")
     parser.add_argument("--repeats", type=int, default=2, help="the fastest counts")
     parser.add_argument("--seed", type=int, default=20230213)
+    parser.add_argument("--growth", action="store_true", help="that alone; needs a run before")
     parser.add_argument("--kernels", action="store_true", help="not the chain again")
     parser.add_argument("--no-profile", dest="profile", action="store_false")
     parser.add_argument("--json", type=Path, help="file for all figures")
@@ -396,6 +497,10 @@ def main() -> int:
     settings = LabelSettings().model_dump()
     report: dict[str, Any] = {"machine": machine(arguments.workers)}
     print(", ".join(f"{k} {v}" for k, v in report["machine"].items()))
+    if arguments.growth:
+        stores = sorted((arguments.folder / "points").glob("*.points"))
+        print(json.dumps(growth(arguments.folder.resolve(), stores, settings), indent=1))
+        return 0
     if not arguments.kernels:
         report["chain"] = chain(arguments, settings)
         show_chain(report["chain"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from pathlib import Path
@@ -39,7 +40,7 @@ autodoc_default_options = {"members": True}
 autodoc_preserve_defaults = True
 
 html_theme = "furo"
-html_title = "stereotruth"
+html_title = f"stereotruth {version}"
 html_copy_source = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
@@ -92,11 +93,32 @@ def complete(app: Sphinx, page: str, source: list[str]) -> None:
 
     text = with_links(source[0], here, page)
     text = INCLUDED.sub(include, text)
+    if shown := NOTEBOOK.search(text):
+        app.env.note_dependency(str(here.parent / shown[1]))
+        text = notebook(here.parent / shown[1])
     if "<!-- command line -->" in text:
         for code in (Path(__file__), *COMMANDS.glob("*.py")):  # the page follows from these
             app.env.note_dependency(str(code))
         text = text.replace("<!-- command line -->", command_line())
     source[0] = text
+
+
+NOTEBOOK = re.compile(r"^<!-- notebook: (\S+) -->$", re.MULTILINE)
+
+
+def notebook(file: Path) -> str:
+    """An executed notebook as Markdown: its text, code, what that said, and pictures."""
+    parts = []
+    for cell in json.loads(file.read_text(encoding="utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", []):
+            if "text" in output:
+                parts.append(f"```text\n{''.join(output['text'])}```")
+            else:
+                png = output["data"]["image/png"]
+                parts.append(f'<img alt="What the code draws" src="data:image/png;base64,{png}">')
+    return "\n\n".join(parts) + "\n"
 
 
 EXAMPLES = re.compile(r"^\[bold\]Examples\[/bold\]\n((?:\n\[cyan\].*\[/cyan\]\n)+)", re.MULTILINE)

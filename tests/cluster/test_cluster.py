@@ -142,8 +142,9 @@ def test_a_job_killed_for_its_memory_is_retried_with_more(runs: Runs) -> None:
 def test_strips_are_jobs_on_several_nodes_that_write_whole_shards_of_one_store(runs: Runs) -> None:
     store = runs.slurm.folder / "results/project/East/East-1.zarr"
     assert len(list((store / "disparity/c").glob("[01]/0"))) == 2
-    strips = [job for job in runs.jobs if "rule_rectify_strip" in job.comment]
-    assert [job.state for job in strips] == 2 * ["COMPLETED"]
+    for rule in ("surface", "rectify"):
+        strips = [job for job in runs.jobs if f"rule_{rule}_strip" in job.comment]
+        assert [job.state for job in strips] == 2 * ["COMPLETED"]
     assert len({job.node for job in strips}) == 2
 
 

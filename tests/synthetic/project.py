@@ -149,7 +149,7 @@ def copy_project(folder: Path) -> Project:
     """Copy what a clone holds of the workflow and the package into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(ROOT / "Snakefile", folder)
-    for name in ("workflow", "config", "profiles", "envs", "src"):
+    for name in ("workflow", "config", "profiles", "src"):
         ignore = shutil.ignore_patterns("__pycache__", "*.egg-info")
         shutil.copytree(ROOT / name, folder / name, ignore=ignore)
     return Project(folder)

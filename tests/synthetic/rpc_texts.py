@@ -36,8 +36,8 @@ def rpb_text(values: Mapping[str, Any], spec: str = "RPC00B", more: Sequence[str
     return "\n".join([*lines, "END_GROUP = IMAGE", "END;", ""])
 
 
-def dimap_text(values: Mapping[str, Any]) -> str:
-    """``RPC_….XML`` of Pléiades and SPOT (DIMAP 2), whose pixels count from 1."""
+def dimap_text(values: Mapping[str, Any], version: int = 2) -> str:
+    """``RPC_….XML`` of DIMAP 2 (Pléiades, SPOT), whose pixels count from 1, or 3 (Pléiades Neo)."""
     names = [name for name in values if not name.startswith("err")]
     inverse = "".join(
         f"<{name.upper()}_{i}>{v!r}</{name.upper()}_{i}>"
@@ -45,7 +45,8 @@ def dimap_text(values: Mapping[str, Any]) -> str:
         if isinstance(values[name], list)
         for i, v in enumerate(values[name], start=1)
     )
-    first = {"samp_off": 1, "line_off": 1}
+    first = {"samp_off": 1, "line_off": 1} if version == 2 else {}
+    model = "Inverse_Model" if version == 2 else "GroundtoImage_Values"
     validity = "".join(
         f"<{name.upper()}>{values[name] + first.get(name, 0)!r}</{name.upper()}>"
         for name in names
@@ -53,6 +54,27 @@ def dimap_text(values: Mapping[str, Any]) -> str:
     )
     return (
         "<Dimap_Document><Rational_Function_Model><Global_RFM>"
-        f"<Inverse_Model>{inverse}</Inverse_Model><RFM_Validity>{validity}</RFM_Validity>"
+        f"<{model}>{inverse}</{model}><RFM_Validity>{validity}</RFM_Validity>"
         "</Global_RFM></Rational_Function_Model></Dimap_Document>"
+    )
+
+
+def vantor_text(values: Mapping[str, Any], namespace: str = "") -> str:
+    """``.XML`` of Vantor with an IMD and an RPB, in a namespace as since 2026, or in none."""
+    fields = ""
+    for name, value in values.items():
+        tag = name.upper().replace("_OFF", "OFFSET").replace("COEFF", "COEF").replace("_", "")
+        if isinstance(value, list):
+            fields += f"<{tag}List><{tag}>{' '.join(map(repr, value))}</{tag}></{tag}List>"
+        elif value is not None:
+            fields += f"<{tag}>{value!r}</{tag}>"
+    image = (
+        "<FIRSTLINETIME>2020-10-25T03:12:45.000000Z</FIRSTLINETIME>"
+        "<MEANSUNAZ>161.5</MEANSUNAZ><MEANSUNEL>44.9</MEANSUNEL>"
+    )
+    root = f'<isd xmlns="{namespace}">' if namespace else "<isd>"
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n{root}<IMD><IMAGE>{image}</IMAGE></IMD>'
+        "<EPH><STARTTIME>2020-10-25T03:10:00.000000Z</STARTTIME></EPH>"
+        f"<RPB><SPECID>RPC00B</SPECID><IMAGE>{fields}</IMAGE></RPB></isd>"
     )

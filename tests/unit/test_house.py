@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 HOUSE = ROOT / "src"
 TESTS = ROOT / "tests"
 MOST_LINES = 500  # of a file
-MOST_FILES = 235
+MOST_FILES = 237
 MOST_FUNCTION_LINES, MOST_PARAMETERS = 100, 10  # ``self`` and ``cls`` apart
 # Functions beyond, to be emptied: (lines, parameters).
 LONG_FUNCTIONS = {
@@ -239,7 +239,8 @@ def test_tests_mirror_the_house():
 NOT_OF_A_FILE = {"bench", "doors", "house"}
 
 
-DOCUMENTED = {"config.CACHE_DIR = …"}  # numba.config: its variables may be set
+VARIABLES = "CACHE_DIR", "CACHE_LOCATOR_CLASSES", "CPU_NAME", "CPU_FEATURES"
+DOCUMENTED = {f"config.{name} = …" for name in VARIABLES}  # Numba's, which may be set
 PUBLIC_ALL_THE_SAME = {"_replace", "_asdict", "_fields", "_make"}  # of named tuples
 
 

@@ -163,12 +163,15 @@ def test_the_wheel_brings_the_workflow_to_an_empty_environment(tmp_path):
     empty.mkdir()
     for name in ("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "Snakefile"):
         shutil.copy(ROOT / name, source)
-    for name in ("src", "workflow", "config", "profiles", "envs"):
+    for name in ("src", "workflow", "config", "profiles"):
         ignore = shutil.ignore_patterns("__pycache__", "*.egg-info")
         shutil.copytree(ROOT / name, source / name, ignore=ignore)
+    (source / "kernels/made").mkdir(parents=True)
+    (source / "kernels/made/file.nbi").touch()
     unwanted = ("PYTHONPATH", "NUMBA_CACHE_DIR")
     environment = {name: v for name, v in os.environ.items() if name not in unwanted}
     environment["PATH"] = f"{tmp_path / 'venv/bin'}:/usr/bin:/bin"
+    environment["STEREOTRUTH_KERNELS"] = str(source / "kernels")
 
     def do(*command: str | Path) -> str:
         done = subprocess.run(
@@ -192,7 +195,11 @@ def test_the_wheel_brings_the_workflow_to_an_empty_environment(tmp_path):
     (site,) = (tmp_path / "venv/lib").glob("python*/site-packages")
     (site / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
 
+    assert (site / "stereotruth/core/compiled/made/file.nbi").is_file()
     assert str(site) in do(python, "-c", "import stereotruth; print(stereotruth.__file__)")
+    (said,) = site.glob("stereotruth-*.dist-info/METADATA")
+    links = re.findall(r"\]\(([^)]*)\)", said.read_text("utf-8"))
+    assert links and all(link.startswith("https:") for link in links)
     plan = do("stereotruth", "run", "--example", "tiles/Qichun", "--dry-run", "--cores", "1")
     assert "simulate_lidar       12" in plan and "shipped/profiles/default" in plan
     do("stereotruth", "init", "mine")

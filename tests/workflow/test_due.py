@@ -20,14 +20,15 @@ import yaml
 from ..synthetic.hollow_workflow import GO_ON, Hollow
 
 pytestmark = pytest.mark.slow
-STRIPS = {"rectify": {"rectify_strip"}, "project": {"project_strip"}}
-SHARED = {"rectify_strip": "rectify", "project_strip": "project"}  # scripts of several rules
+STRIPS = {"rectify", "surface", "project"}
+SHARED = {f"{rule}_strip": rule for rule in STRIPS}  # scripts of several rules
 SHARED |= {"evaluate_truth_city": "evaluate_truth"}
 OF_TILES = {"evaluate_images", "report_city", "originals", "dataset", "audit", "match", "score"}
 OF_TILES |= {"submission", "benchmark_tables", "train"}
 OF_TRUTH = {"evaluate_truth", "evaluate_truth_city"}  # only of the synthetic city
 OF_IMAGES = {"predict_scene", "dsm", "score_dsm"}
-PROJECT = {"project", *STRIPS["project"], "export", *OF_TILES}
+SURFACE = {"surface", "surface_strip"}
+PROJECT = {"project", "project_strip", "export", *OF_TILES}
 RECTIFY = {"rectify", "rectify_strip", *OF_IMAGES, *PROJECT}
 GRID_TRUTH = {"grid_truth", *OF_TRUTH}
 REFINE = {"refine", "draw_refinement"}
@@ -35,11 +36,11 @@ ALIGN = {"align", "draw_residuals", *REFINE}
 METHOD = {"match", "score", "submission", "benchmark_tables", *OF_IMAGES}
 FILES: list[tuple[str, set[str]]] = [
     ("in/gcps.csv", {*ALIGN, *RECTIFY}),
-    ("in/left.tif", {"surface", *ALIGN, *RECTIFY}),
-    ("in/left.tif.msk", {"surface", *ALIGN, *RECTIFY}),  # a new one
-    ("in/lidar/1.laz", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),
-    ("in/lidar/3.laz", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),  # a new one
-    ("geoid.tif", {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY}),
+    ("in/left.tif", {*SURFACE, *ALIGN, *RECTIFY}),
+    ("in/left.tif.msk", {*SURFACE, *ALIGN, *RECTIFY}),  # a new one
+    ("in/lidar/1.laz", {"ingest", "compare_strips", *SURFACE, *REFINE, *RECTIFY}),
+    ("in/lidar/3.laz", {"ingest", "compare_strips", *SURFACE, *REFINE, *RECTIFY}),  # a new one
+    ("geoid.tif", {"ingest", "compare_strips", *SURFACE, *REFINE, *RECTIFY}),
     ("mine.py", METHOD),
     ("helper.py", METHOD),  # which mine.py imports
 ]
@@ -47,7 +48,7 @@ KEYS: list[tuple[str, Any, set[str]]] = [
     (
         "ingest.drop_classes",
         [7],
-        {"ingest", "compare_strips", "surface", *REFINE, *RECTIFY, *GRID_TRUTH},
+        {"ingest", "compare_strips", *SURFACE, *REFINE, *RECTIFY, *GRID_TRUTH},
     ),
     ("alignment.model", "shift", {*ALIGN, *RECTIFY, *GRID_TRUTH}),
     ("rectify.panchromatic", 1, {*REFINE, *RECTIFY, *GRID_TRUTH}),

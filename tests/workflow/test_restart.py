@@ -104,7 +104,7 @@ def test_strips_by_jobs_of_their_own_give_the_same_bytes(made, fresh):
     config = fresh.folder / "tiny.yaml"
     config.write_text(config.read_text() + "strips: {Tiny-1: 2}\n")
     plan = fresh.plan(*ARGUMENTS)
-    assert plan["rectify_strip"] == plan["project_strip"] == 2
+    assert plan["rectify_strip"] == plan["surface_strip"] == plan["project_strip"] == 2
     run = fresh.snakemake(*ARGUMENTS)
     assert run.status == 0, run.text[-3000:]
     assert hashes(fresh.folder) == hashes(made.folder)

@@ -158,6 +158,10 @@ def test_crops_of_originals_have_the_heights_beside_them(site: Path) -> None:
             assert measured.sum() > 0.9 * usable.sum()
             error = np.abs(height.filled(np.nan) - truth["height"])[measured]
             assert np.median(error) < 0.02 and (error > 1.0).mean() < 0.001
+            with rasterio.open(folder / row[f"{view}_visibility"]) as crop:
+                seen = crop.read(1)
+            assert (seen[np.ma.getmaskarray(height)] == 0).all()
+            assert (seen[measured] == 1).mean() > 0.7 and 0 < (seen[measured] == 2).mean() < 0.1
 
 
 def test_the_site_has_a_page_that_leads_to_its_pairs(site: Path) -> None:

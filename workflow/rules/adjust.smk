@@ -13,8 +13,6 @@ rule adjust:
         "logs/adjust/{city}.log",
     benchmark:
         "logs/adjust/{city}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=30,
@@ -42,8 +40,6 @@ rule adjusted_alignment:
         "logs/adjusted_alignment/{city}/{scene}.log",
     benchmark:
         "logs/adjusted_alignment/{city}/{scene}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=1000,
         runtime=10,

@@ -15,8 +15,6 @@ rule align:
         "logs/align/{city}/{scene}.log",
     benchmark:
         "logs/align/{city}/{scene}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=1000,
         runtime=10,
@@ -48,8 +46,6 @@ rule draw_residuals:
         "logs/draw_residuals/{city}/{scene}.log",
     benchmark:
         "logs/draw_residuals/{city}/{scene}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=1000,
         runtime=10,

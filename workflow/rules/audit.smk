@@ -7,8 +7,6 @@ rule audit:
         "logs/audit/{dataset}.log",
     benchmark:
         "logs/audit/{dataset}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=4000,

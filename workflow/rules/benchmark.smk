@@ -8,8 +8,6 @@ rule match:
         "logs/match/{dataset}/{method}.log",
     benchmark:
         "logs/match/{dataset}/{method}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=6000,
@@ -39,8 +37,6 @@ rule score:
         "logs/score/{dataset}/{method}.tsv"
     wildcard_constraints:
         method="[^/.]+",  # not a table of all methods
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=120,
@@ -74,8 +70,6 @@ rule submission:
         "logs/submission/{dataset}/{method}.tsv"
     wildcard_constraints:
         method="[^/.]+",
-    conda:
-        CONDA
     resources:
         mem_mb=1000,
         runtime=30,
@@ -123,8 +117,6 @@ rule benchmark_tables:
         "logs/benchmark_tables/{dataset}.log",
     benchmark:
         "logs/benchmark_tables/{dataset}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=30,

@@ -12,8 +12,6 @@ rule closure_of_site:
         "logs/closure_of_site/{city}.log",
     benchmark:
         "logs/closure_of_site/{city}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=3000,
         runtime=120,

@@ -8,7 +8,6 @@ from stereotruth.core.config.configuration import Configuration
 from stereotruth.core.errors import InputError, in_words
 from stereotruth.core.products.provenance import SOURCES, file_sha256, source_digest
 from stereotruth.project.project import (
-    FILES,
     adjusted_scenes,
     check_fixed,
     days_of_pair,
@@ -26,7 +25,6 @@ from stereotruth.project.project import (
 from stereotruth.core.tables import epoch_year
 from stereocities import cities
 
-CONDA = FILES / "envs" / "workflow.yaml"
 VIEWS = ("left", "right")
 
 

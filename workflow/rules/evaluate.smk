@@ -9,8 +9,6 @@ rule grid_truth:
         "logs/grid_truth/{city}/{scene}.log",
     benchmark:
         "logs/grid_truth/{city}/{scene}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=3000,
@@ -41,8 +39,6 @@ rule evaluate_truth:
         "logs/evaluate_truth/{city}/{scene}.log",
     benchmark:
         "logs/evaluate_truth/{city}/{scene}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=3000,

@@ -35,8 +35,6 @@ rule evaluate_images:
         "logs/evaluate_images/{city}.log",
     benchmark:
         "logs/evaluate_images/{city}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=30,

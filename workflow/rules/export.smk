@@ -32,8 +32,6 @@ rule export:
         "logs/export/{city}.tsv"
     wildcard_constraints:
         city="[^/]+",  # so that scenes_of can name the cities that there are
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=4000,
@@ -69,8 +67,6 @@ rule originals:
         "logs/originals/{city}.log",
     benchmark:
         "logs/originals/{city}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=2000,
@@ -78,6 +74,9 @@ rule originals:
     params:
         sources=upstream("originals"),
         images=lambda w: {s.scene: IMAGE_NAMES[s.scene] for s in scenes_of(w.city)},
+        cells=lambda w: {
+            s.scene: [cells_of(name) for name in IMAGE_NAMES[s.scene]] for s in scenes_of(w.city)
+        },
         code=source_digest("stereotruth.tiles.originals"),
     message:
         "Cropping the original images of {wildcards.city}"
@@ -96,8 +95,6 @@ rule dataset:
         "logs/dataset/dataset.log",
     benchmark:
         "logs/dataset/dataset.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=1000,
         runtime=60,
@@ -119,8 +116,6 @@ rule dataset:
 rule verify:
     log:
         "logs/verify/verify.log",
-    conda:
-        CONDA
     resources:
         mem_mb=1000,
         runtime=60,

@@ -12,8 +12,6 @@ rule image_heights:
         "logs/image_heights/{city}/{image}.log",
     benchmark:
         "logs/image_heights/{city}/{image}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=4000,

@@ -8,8 +8,6 @@ rule ingest:
         "logs/ingest/{city}/{scene}/{lidar}.log",
     benchmark:
         "logs/ingest/{city}/{scene}/{lidar}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=60,

@@ -101,10 +101,15 @@ def fixed_images(wildcards):
     return {k: v for k, v in SETTINGS.alignment.fixed.items() if k in images}
 
 
-def strips_made(wildcards, file):
-    """The files that tell that the strips of a scene are made; none if one job makes it all."""
+def strips_made(wildcards, file, scenes=None):
+    """The files that tell that the strips of a scene are made; none if one job makes it all.
+
+    ``scenes``: all that have the product in common, of which the most strips count.
+    """
     strips = SETTINGS.strips
-    count = strips if isinstance(strips, int) else strips.get(wildcards.scene, 1)
+    if not isinstance(strips, int):
+        strips = max(strips.get(scene, 1) for scene in scenes or [wildcards.scene])
+    count = strips
     names = [f"{k}-of-{count}" for k in range(count)] if count > 1 else []
     return expand(file, **wildcards, strip=names)
 
@@ -164,9 +169,14 @@ def point_stores_of_city(wildcards):
     return paths_of_stores(wildcards.city, dict.fromkeys(stores))
 
 
+def scenes_of_surface(wildcards):
+    """Names of the scenes that a surface is for: those that take the same points."""
+    return [scene for scene, first in SURFACES.items() if first == wildcards.scene]
+
+
 def images_of_surface(wildcards):
     """The images that the surface of some points is for, each once."""
-    scenes = [SCENES[scene] for scene, first in SURFACES.items() if first == wildcards.scene]
+    scenes = [SCENES[scene] for scene in scenes_of_surface(wildcards)]
     images = (image for scene in scenes for image in (scene.left_image, scene.right_image))
     return [given(image) for image in dict.fromkeys(images)]
 

@@ -9,8 +9,6 @@ rule predict_scene:
         "logs/predict_scene/{city}/{scene}/{method}.log",
     benchmark:
         "logs/predict_scene/{city}/{scene}/{method}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=6000,
@@ -36,8 +34,6 @@ rule dsm:
         "logs/dsm/{city}/{scene}/{method}.log",
     benchmark:
         "logs/dsm/{city}/{scene}/{method}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=2000,
@@ -63,8 +59,6 @@ rule score_dsm:
         "logs/score_dsm/{city}/{scene}/{method}.log",
     benchmark:
         "logs/score_dsm/{city}/{scene}/{method}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=3000,
         runtime=240,

@@ -16,8 +16,6 @@ rule project:
         "logs/project/{city}/{scene}{side}.log",
     benchmark:
         "logs/project/{city}/{scene}{side}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=4000,

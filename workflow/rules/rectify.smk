@@ -14,8 +14,6 @@ rule rectify:
         "logs/rectify/{city}/{scene}.log",
     benchmark:
         "logs/rectify/{city}/{scene}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=2000,

@@ -19,8 +19,6 @@ rule refine:
         "logs/refine/{city}/{scene}.log",
     benchmark:
         "logs/refine/{city}/{scene}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=30,
@@ -52,8 +50,6 @@ rule draw_refinement:
         "logs/draw_refinement/{city}/{scene}.log",
     benchmark:
         "logs/draw_refinement/{city}/{scene}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=1000,
         runtime=10,

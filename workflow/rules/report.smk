@@ -23,8 +23,6 @@ rule report_city:
         "logs/report_city/{city}.log",
     benchmark:
         "logs/report_city/{city}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=2000,
@@ -58,8 +56,6 @@ rule report_site:
         "logs/report_site/{city}.log",
     benchmark:
         "logs/report_site/{city}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=30,

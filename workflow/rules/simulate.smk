@@ -8,8 +8,6 @@ rule simulate_city:
         "logs/simulate_city/{city}.log",
     benchmark:
         "logs/simulate_city/{city}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=8000,  # of a twin 2 km wide; a drawn city takes a quarter
         runtime=30,
@@ -33,8 +31,6 @@ rule simulate_image:
         "logs/simulate_image/{city}/{scene}/{view}.log",
     benchmark:
         "logs/simulate_image/{city}/{scene}/{view}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=3000,
         runtime=30,
@@ -58,8 +54,6 @@ rule simulate_lidar:
         "logs/simulate_lidar/{city}/{scene}/{tile}.log",
     benchmark:
         "logs/simulate_lidar/{city}/{scene}/{tile}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=3000,
         runtime=30,
@@ -87,8 +81,6 @@ rule simulate_truth:
         "logs/simulate_truth/{city}/{scene}.log",
     benchmark:
         "logs/simulate_truth/{city}/{scene}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=3000,
         runtime=30,

@@ -10,8 +10,6 @@ rule compare_strips:
         "logs/compare_strips/{city}/{scene}.log",
     benchmark:
         "logs/compare_strips/{city}/{scene}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=60,
@@ -35,8 +33,6 @@ rule move_strips:
         "logs/move_strips/{city}/{scene}/{origin}/{lidar}.log",
     benchmark:
         "logs/move_strips/{city}/{scene}/{origin}/{lidar}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=2000,
         runtime=60,

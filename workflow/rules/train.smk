@@ -16,8 +16,6 @@ rule train:
         "logs/train/{dataset}/{method}.log",
     benchmark:
         "logs/train/{dataset}/{method}.tsv"
-    conda:
-        CONDA
     threads: 2
     resources:
         mem_mb=12000,

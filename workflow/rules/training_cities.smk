@@ -10,8 +10,6 @@ rule training_city:
         "logs/training_city/{number}.log",
     benchmark:
         "logs/training_city/{number}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=3000,
         runtime=60,
@@ -38,8 +36,6 @@ rule training_cities:
         "logs/training_cities/{tiles}.log",
     benchmark:
         "logs/training_cities/{tiles}.tsv"
-    conda:
-        CONDA
     resources:
         mem_mb=500,
         runtime=30,

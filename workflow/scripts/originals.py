@@ -1,4 +1,4 @@
-"""Crops of one city's original images, with corrected RPCs and heights."""
+"""Crops of one city's original images, with corrected cameras and heights."""
 
 from pathlib import Path
 
@@ -17,5 +17,6 @@ if __name__ == "__main__":
             snakemake.output[0],
             images,
             heights if stores else None,
+            cells=snakemake.params.cells,
             workers=snakemake.threads,
         )

@@ -3,6 +3,9 @@
 Numba keeps compiled code on disk, and knows it by the source file of the kernel alone. A kernel
 also follows from what its module imports, so each state of these sources has a folder of its own:
 after an edit of any of them the kernel is compiled again, and old code is never taken for new.
+
+Kernels are compiled for the processors of :data:`TARGET` wherever the machine is one of them. So
+the nodes of a cluster share them, and a wheel or a container brings them along.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import hashlib
 import logging
 import os
 import re
+import shutil
 import sys
 import tempfile
 import threading
@@ -19,20 +23,33 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from types import FunctionType
 from typing import IO
 
+from llvmlite.binding import get_host_cpu_features
 from numba import config, njit
+from numba.core.caching import UserProvidedCacheLocator
 from numba.core.event import Event, Listener, register
 from numba.extending import register_jitable
 
 log = logging.getLogger("stereotruth.compiling")
 PACKAGE = Path(__file__).parent
+SHIPPED = PACKAGE / "compiled"
+"""Kernels that a wheel brings along (``make wheel``)."""
+
+TARGET = "x86-64-v3"
+_OF_TARGET = {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"}
+_OF_HOST = {name for name, there in get_host_cpu_features().items() if there}
+if config.CPU_NAME is None and config.CPU_FEATURES is None and _OF_HOST >= _OF_TARGET:
+    config.CPU_NAME, config.CPU_FEATURES = TARGET, ""
 _OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}
 if config.BOUNDSCHECK:  # NUMBA_BOUNDSCHECK=1: kernels refuse indices out of bounds
     _OPTIONS["boundscheck"] = True
 _IMPORT = re.compile(  # at the start of a line: what a function imports, no kernel can call
     r"^(?:from\s+([.\w]+)\s+import\s+(\([^)]*\)|[^\n]*)|import\s+([^\n]+))", re.MULTILINE
 )
+
+_kernels: set[Callable] = set()
 
 inner: Callable = register_jitable(**_OPTIONS)
 """A function that kernels call; plain Python where Python calls it.
@@ -48,14 +65,42 @@ the simulator's rays (1000 against 290 ns a ray, textures and shadows included).
 """
 
 
+class KernelLocator(UserProvidedCacheLocator):
+    """Tells Numba where a kernel is kept: the same place wherever the package is installed."""
+
+    def __init__(self, function: FunctionType, file: str) -> None:
+        super().__init__(function, file)
+        self._folder = config.CACHE_DIR
+
+    def get_cache_path(self) -> str:
+        """The folder of the kernel's sources."""
+        return self._folder
+
+
 def kernel(function: Callable) -> Callable:
     """A compiled loop over points or pixels, which Python calls."""
-    named = config.CACHE_DIR
-    config.CACHE_DIR = str(folder() / sources_digest(function.__module__))
+    _kernels.add(function)
+    named = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
+    config.CACHE_DIR = str(_kept(sources_digest(function.__module__)))
+    config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"
     try:
         return njit(nogil=True, cache=True, **_OPTIONS)(function)
     finally:
-        config.CACHE_DIR = named
+        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = named
+
+
+def _kept(digest: str) -> Path:
+    """The folder of the kernels of some sources; those that the wheel brought are copied there."""
+    place, shipped = folder() / digest, SHIPPED / digest
+    if shipped.is_dir() and not place.exists():
+        place.parent.mkdir(exist_ok=True)
+        scratch = tempfile.mkdtemp(dir=place.parent)
+        shutil.copytree(shipped, scratch, dirs_exist_ok=True)
+        try:
+            Path(scratch).rename(place)
+        except OSError:  # another process was first
+            shutil.rmtree(scratch)
+    return place
 
 
 def source_modules(module: str) -> list[str]:
@@ -146,9 +191,14 @@ class _Compilation(Listener):
             log.info("compiling, first run only")
 
     def on_end(self, event: Event) -> None:
-        """What is compiled will be kept; or it was, with the outermost of Numba's locks."""
+        """A kernel is compiled and will be kept; or it was, with the outermost of Numba's locks.
+
+        What kernels call is compiled first and not kept: claimed from then on, processes would
+        compile one after the other.
+        """
         if event.kind == "numba:compile":
-            if getattr(self.thread, "claim", None) is None:
+            is_kernel = event.data["dispatcher"].py_func in _kernels
+            if is_kernel and getattr(self.thread, "claim", None) is None:
                 self.thread.claim = _claim()
             return
         self.thread.depth -= 1

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.kernels import kernel
 from .window_sums import (
+    ANY_BRIGHTNESS,
     SURFACE_PX,
     Bools,
     Floats,
@@ -71,7 +72,7 @@ def correlations(
     is wide: a few correlate by chance. 0 where either image is constant.
     """
     windows = disparity, slope, counts, window // 2
-    out, _ = _correlations(left, warped, windows, None, window, runs)
+    out, _ = _correlations(left, warped, windows, ANY_BRIGHTNESS, window, runs)
     return out
 
 
@@ -79,7 +80,7 @@ def _correlations(
     left: Image,
     warped: Image,
     windows: tuple[Image, Image, Bools, int],
-    bright: Singles | None,
+    bright: Singles,
     least: int,
     runs: Runs,
 ) -> tuple[Singles, Singles]:
@@ -88,7 +89,7 @@ def _correlations(
     members = members_of(*windows)
     reach, count = members.reach, len(warped)
     out = np.empty((count + 4, *left.shape), np.float32)
-    if bright is not None:
+    if len(bright):
         bright = padded(bright, np.nan, reach)
     (wide,), others = padded(left[None], 0.0, reach), padded(warped, 0.0, reach)
     correlate(members, bright, wide, others, least, runs, out[:count], out[count:])
@@ -147,7 +148,7 @@ def correlation_and_expected(
     if runs is None:
         runs = wanted_runs(np.isfinite(centres))
     windows = centres, slope, counts, window // 2
-    (out,), moments = _correlations(left, warped[None], windows, None, window, runs)
+    (out,), moments = _correlations(left, warped[None], windows, ANY_BRIGHTNESS, window, runs)
     expected = np.empty(left.shape, np.float32)
     _expected(moments, noise, expected)
     return out, expected
@@ -244,14 +245,14 @@ def _surface_means(
     values: Image,
     surface: tuple[Image, Image],
     steps: tuple[int, int, int],
-    bright: Singles | None,
+    bright: Singles,
     runs: Runs,
 ) -> Singles:
     """Of :func:`.window_sums.take_means`; ``steps``: reach, every and first row of its members,
     ``bright`` [4, h, w]."""
     out = np.empty(values.shape, np.float32)
     members = members_of(*surface, np.isfinite(values[0]), *steps)
-    if bright is not None:
+    if len(bright):
         bright = padded(bright, np.nan, *steps)
     take_means(members, bright, padded(values, 0.0, *steps), runs, out)
     return out
@@ -278,7 +279,7 @@ def surface_means(
     if runs is None:
         runs = wanted_runs(np.isfinite(disparity))
     return _surface_means(
-        values, (disparity, slope), (reach, every, -first_row % every), None, runs
+        values, (disparity, slope), (reach, every, -first_row % every), ANY_BRIGHTNESS, runs
     )
 
 

@@ -53,7 +53,7 @@ def warp_rows(image: NDArray[np.floating], x: Floats) -> Floats:
     (0) or outside the image.
     """
     out = np.empty(x.shape)
-    _warp(image, x, out)
+    _warp(*(np.ascontiguousarray(values, np.float64) for values in (image, x)), out)
     return out
 
 

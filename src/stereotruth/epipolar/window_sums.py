@@ -38,8 +38,10 @@ BEND = 0.1
 BLOCK, REGISTER, TOGETHER = 256, 16, 3
 GAP = 8  # pixels that nobody wants and that end no run of wanted ones
 
-# [4, h, wide]: brightness of both images, and by how much it may differ; None: it may be anything.
-Bright = Singles | None
+# [4, h, wide]: brightness of both images, and by how much it may differ; [0, …]: by anything. No
+# argument of a kernel here is of two types, since each would be compiled by itself.
+Bright = Singles
+ANY_BRIGHTNESS: Bright = np.empty((0, 0, 0), np.float32)
 
 
 @kernel
@@ -89,18 +91,17 @@ class Members(NamedTuple):
 
 @kernel
 def _pad(
-    values: Image, counts: Bools | None, reach: int, rows: tuple[int, int], fill: float,
-    out: Singles,
-) -> None:  # fmt: skip
+    values: Singles, counts: Bools, reach: int, rows: tuple[int, int], fill: float, out: Singles
+) -> None:
     cols = values.shape[2]
     for n in range(len(values)):
         for y in range(rows[0], values.shape[1], rows[1]):
             row = out[n, y]
             row[:reach], row[reach + cols :] = fill, fill
             for x in range(cols):
-                value = np.float32(values[n, y, x])
+                value = values[n, y, x]
                 row[reach + x] = value if np.isfinite(value) else fill
-            if counts is not None:
+            if len(counts):
                 for x in range(cols):
                     row[reach + x] = row[reach + x] if counts[y, x] else fill
 
@@ -119,7 +120,8 @@ def padded(
     wide = reach + values.shape[2] + reach + TOGETHER * every + REGISTER
     out = np.empty((*values.shape[:2], wide), np.float32)
     rows = (0, 1) if first_row < 0 else (first_row, every)
-    _pad(values, counts, reach, rows, np.float32(fill), out)
+    counted = np.empty((0, 0), np.bool_) if counts is None else np.ascontiguousarray(counts)
+    _pad(np.ascontiguousarray(values, np.float32), counted, reach, rows, np.float32(fill), out)
     return out
 
 
@@ -145,7 +147,7 @@ def _centres(members: Members, bright: Bright, y: int, x0: int, size: int, c: Si
         c[k] = disparity[y, x0 + k]
         c[BLOCK + k] = slope[0, y, x0 + k]
         c[2 * BLOCK + k] = slope[1, y, x0 + k]
-    if bright is not None:
+    if len(bright):
         for m in range(4):
             for k in range(size):
                 c[(3 + m) * BLOCK + k] = bright[m, y, members.reach + x0 + k]
@@ -199,7 +201,7 @@ def _belong(
         weight[k] = _is_near(d[k], level + across[0] * along + rise, limit[0])
         weight[BLOCK + k] = _is_near(dd[k], level + across[1] * along + rise, limit[1])
         weight[2 * BLOCK + k] = _is_near(ddd[k], level + across[2] * along + rise, limit[2])
-    if bright is not None:
+    if len(bright):
         for m in range(TOGETHER):
             first, w = at + m * every, weight[m * BLOCK :]
             u, v = bright[0, b, first:], bright[1, b, first:]

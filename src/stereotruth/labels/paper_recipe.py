@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, kernel
 from ..core.status import Status
 from ..lidar.lattice import PER_DEG, PER_M
 from .layers import layers, layers_of
@@ -44,6 +44,7 @@ Bools = NDArray[np.bool_]
 PART_PX = 256  # side of the parts of a block whose points are in memory at once
 # A variance below this share of the mean square is what rounding leaves of a constant window.
 CONSTANT = 1e-13
+WIDE = 16  # columns that are summed at once
 DAY_BITS, CLASS_BITS = 16, 8
 
 
@@ -103,41 +104,59 @@ def points_of(ground: WindowGround, window: PairWindow) -> tuple[Points, Pixels]
     )
 
 
-@inner
-def _sample(
-    image: Singles, row: int, col: int, size: int, fx: float, fy: float, out: Floats
-) -> None:
-    """A window of ``size`` x ``size`` bilinear samples, the first (fx, fy) px from a pixel."""
-    for j in range(size + 1):
-        line = image[row + j, col : col + size + 1]
-        above, below = out[(j - 1) * size : j * size], out[j * size : (j + 1) * size]
-        for i in range(size):
-            value = (1.0 - fx) * line[i] + fx * line[i + 1]
-            if j > 0:
-                above[i] += fy * value
-            if j < size:
-                below[i] = (1.0 - fy) * value
+@inlined
+def _add_row(
+    images: tuple[Singles, Singles], at: tuple[int, int], across: tuple[float, float],
+    down: tuple[float, float], first: tuple[float, float], work: Singles,
+) -> None:  # fmt: skip
+    """Adds a row of samples of both windows to the sums in ``work`` [7 * WIDE]: of u, v, u², v²,
+    u v by column; then there are the row's values between columns.
+
+    Rows of the flat ``images`` begin ``at``; samples lie ``across`` px past a column, ``down`` px
+    past the row before, and count about the ``first`` one. By WIDE columns, since one sum would
+    take its samples one after the other; in one array, as in :mod:`.window_sums`.
+    """
+    (fx, gx), (fy, gy), (p, q) = across, down, first
+    a, b = images[0][at[0] :], images[1][at[1] :]
+    for i in range(WIDE):
+        here = (a[i] - p) + fx * (a[i + 1] - a[i])
+        there = (b[i] - q) + gx * (b[i + 1] - b[i])
+        u = work[5 * WIDE + i] + fy * (here - work[5 * WIDE + i])
+        v = work[6 * WIDE + i] + gy * (there - work[6 * WIDE + i])
+        work[i], work[WIDE + i] = work[i] + u, work[WIDE + i] + v
+        work[2 * WIDE + i] += u * u
+        work[3 * WIDE + i] += v * v
+        work[4 * WIDE + i] += u * v
+        work[5 * WIDE + i], work[6 * WIDE + i] = here, there
 
 
 @kernel
-def _correlate(left: Singles, right: Singles, places: Ints, size: int, out: Singles) -> None:
-    """Of points whose windows begin at the ``places`` [4, n] (steps) of both images."""
-    a, b = np.empty(size * size), np.empty(size * size)
-    mask = PX - 1
+def _correlate(
+    left: Singles, right: Singles, widths: tuple[int, int], places: Ints, size: int, out: Singles
+) -> None:
+    """Of points whose windows begin at the ``places`` [4, n] (steps) of both flat images, of rows
+    of so many pixels (``widths``) and WIDE pixels more at the end."""
+    work, n, step, mask = np.zeros(7 * WIDE, np.float32), size * size, np.float32(1 / PX), PX - 1
     for k in range(out.size):
-        x, y, x_right, y_right = places[:, k]
-        _sample(left, y >> BITS, x >> BITS, size, (x & mask) / PX, (y & mask) / PX, a)
-        fx, fy = (x_right & mask) / PX, (y_right & mask) / PX
-        _sample(right, y_right >> BITS, x_right >> BITS, size, fx, fy, b)
-        mean_a, mean_b = a.mean(), b.mean()
-        aa = bb = ab = square_a = square_b = 0.0
-        for m in range(a.size):
-            u, v = a[m] - mean_a, b[m] - mean_b
-            aa += u * u
-            bb += v * v
-            ab += u * v
-            square_a += a[m] * a[m]
-            square_b += b[m] * b[m]
+        x, y, x_right, y_right = places[0, k], places[1, k], places[2, k], places[3, k]
+        across = np.float32(x & mask) * step, np.float32(x_right & mask) * step
+        down = np.float32(y & mask) * step, np.float32(y_right & mask) * step
+        su, sv, suu, svv, suv = 0.0, 0.0, 0.0, 0.0, 0.0
+        one = (y >> BITS) * widths[0] + (x >> BITS)
+        other = (y_right >> BITS) * widths[1] + (x_right >> BITS)
+        first = left[one], right[other]
+        for part in range(0, size, WIDE):
+            for row in range(size + 1):
+                at = one + row * widths[0] + part, other + row * widths[1] + part
+                _add_row((left, right), at, across, down, first, work)
+                if row == 0:  # there is no row before
+                    for c in range(5 * WIDE):
+                        work[c] = 0.0
+            for c in range(min(size - part, WIDE)):
+                su, sv, suu = su + work[c], sv + work[WIDE + c], suu + work[2 * WIDE + c]
+                svv, suv = svv + work[3 * WIDE + c], suv + work[4 * WIDE + c]
+        aa, bb, ab = suu - su * su / n, svv - sv * sv / n, suv - su * sv / n
+        square_a, square_b = suu + n * first[0] * first[0], svv + n * first[1] * first[1]
         out[k] = 0.0
         if aa > CONSTANT * square_a and bb > CONSTANT * square_b:
             out[k] = min(max(ab / np.sqrt(aa * bb), -1.0), 1.0)
@@ -155,7 +174,9 @@ def correlate(points: Points, left: Patch, right: Patch, window: int) -> Singles
     corners = ((patch.col + window // 2, patch.row + window // 2) for patch in (left, right))
     first = np.concatenate([*map(np.array, corners)])[:, None] << BITS
     places = np.stack([points.x, points.y, points.x_right, points.y_right]) - first
-    _correlate(left.pixels, right.pixels, places, window, out)
+    images = (np.append(patch.pixels, np.zeros(WIDE, np.float32)) for patch in (left, right))
+    widths = left.pixels.shape[1], right.pixels.shape[1]
+    _correlate(*images, widths, places, window, out)
     return out
 
 

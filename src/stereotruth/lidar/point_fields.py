@@ -1,9 +1,9 @@
 """What the records of points tell beside their places, counted and coded as they are read.
 
 Days. LAS files have either seconds of a GPS week, which tell no day, or adjusted standard GPS time:
-seconds since 1980-01-06 less 10⁹ (LAS 1.4 R16, "Global Encoding", bit 0). Days are counted from
-1970-01-01; 0 stands for none. A point store has a code of 8 bits for the day of each point, 1 + day
-modulo :data:`DAY_CODES`.
+seconds since 1980-01-06 less 10⁹ (LAS 1.4 R16, "Global Encoding", bit 0), or less another offset
+that the header of LAS 1.5 names (bit 6). Days are counted from 1970-01-01; 0 stands for none. A
+point store has a code of 8 bits for the day of each point, 1 + day modulo :data:`DAY_CODES`.
 
 Strips of a flight are told by ``point_source_id``, else by GPS times, where no point was measured
 for a while, else by flags of the edge of a flight line: two edges that follow each other are a line
@@ -134,10 +134,10 @@ class PointTally:
         fields = points.array
         raw = np.frombuffer(fields, np.uint8).reshape(len(points), -1)
         xyz, attributes = np.empty((3, len(points))), np.zeros((2, len(points)), np.uint32)
-        is_adjusted = header.global_encoding.gps_time_type.value == 1
-        if is_adjusted and "gps_time" in fields.dtype.names:
-            _encode_days(np.ascontiguousarray(fields["gps_time"]), self._days, attributes[0])
-        attributes[1] = self._strips_of(fields, raw)
+        times = _times_of(fields, header)
+        if header.global_encoding.gps_time_type.value == 1 and times is not None:
+            _encode_days(times, self._days, attributes[0])
+        attributes[1] = self._strips_of(fields, raw, times)
         extended = header.point_format.id >= 6
         bit = 1 if extended else 32  # of the flags in LAS 1.4, and of the class byte before
         self.synthetic += int(np.count_nonzero(raw[:, 15] & bit))
@@ -154,17 +154,16 @@ class PointTally:
         )
         return xyz[:, :kept], attributes[0, :kept], attributes[1, :kept]
 
-    def _strips_of(self, fields: np.ndarray, raw: Bytes) -> Words:
+    def _strips_of(self, fields: np.ndarray, raw: Bytes, times: Floats | None) -> Words:
         """``point_source_id`` [n], and above bit 15 the code of the time or the edges."""
         code = fields["point_source_id"].astype(np.uint32)
         if not len(code):
             return code
         if self._has_times is None:
-            self._has_times = "gps_time" in fields.dtype.names and fields["gps_time"][0] != 0.0
-        if self._has_times:
-            time = fields["gps_time"]
-            steps = np.floor(np.where(np.isfinite(time), time, 0.0) / BIN_S) % (STRIP_CODES - 1)
-            return code | np.where(time != 0.0, 1 + steps, 0).astype(np.uint32) << 16
+            self._has_times = times is not None and bool(times[0] != 0.0)
+        if self._has_times and times is not None:
+            steps = np.floor(np.where(np.isfinite(times), times, 0.0) / BIN_S) % (STRIP_CODES - 1)
+            return code | np.where(times != 0.0, 1 + steps, 0).astype(np.uint32) << 16
         flags = raw[:, 15 if "classification_flags" in fields.dtype.names else 14]
         _by_edges(flags, np.stack([fields["X"], fields["Y"]], axis=1), self._edges, code)
         return code
@@ -279,6 +278,17 @@ class PointTally:
                 file=file,
                 remedy="write the file again with a finer scale (0.01 m, or 1e-7 degree)",
             )
+
+
+def _times_of(fields: np.ndarray, header: laspy.LasHeader) -> Floats | None:
+    """GPS times [n], s, absolute ones as adjusted time; None of formats without. 0 stays: none."""
+    if "gps_time" not in fields.dtype.names:
+        return None
+    times = np.ascontiguousarray(fields["gps_time"])
+    if header.version.minor < 5 or not header.global_encoding.gps_time_offset:
+        return times
+    shift_s = 1e6 * header.gps_time_offset - ADJUSTED_S
+    return np.where(times != 0.0, times + shift_s, 0.0)
 
 
 # Kernels free the GIL; nothing in them depends on how the points are cut into chunks.

@@ -8,10 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from stereobench.scores.score_method import describe
-
-from ..evaluate.surface_models.score import describe as describe_surface_model
-
 REFUSED = re.compile(r"ERROR (.*?: error: .*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)")
 DEFECT = re.compile(r"ERROR (.*?: unexpected failure)\n((?:(?!\d{4}-\d\d-\d\d ).*\n?)*)")
 
@@ -101,6 +97,8 @@ def _training(product: str, dataset: str, method: str) -> Iterator[str]:
 
 
 def _scores(product: str, dataset: str) -> Iterator[str]:
+    from stereobench.scores.score_method import describe  # seconds, which other runs need not take
+
     summary = _read(product, "scores.json")
     yield f"{summary['label']} on {dataset}: {describe(summary)}; look at {product}/cities.csv"
     for doubt in summary["doubts"]:
@@ -114,7 +112,9 @@ def _audit(product: str, dataset: str) -> Iterator[str]:
 
 
 def _surface_model(product: str, scene: str, method: str) -> Iterator[str]:
-    line = describe_surface_model(_read(product, "scores.json"))
+    from ..evaluate.surface_models.score import describe
+
+    line = describe(_read(product, "scores.json"))
     yield f"Surface model of {scene} by {method}: {line}; look at {product}/index.html"
 
 

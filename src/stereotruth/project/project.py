@@ -46,8 +46,7 @@ from ..sensor.deliveries import read_acquisition
 
 log = logging.getLogger("stereotruth")
 _PACKAGE = Path(__file__).parents[1]
-# Snakefile, workflow/, config/, profiles/ and envs/: of the clone, or what setup.py put into the
-# wheel.
+# Snakefile, workflow/, config/ and profiles/: of the clone, or what setup.py put into the wheel.
 FILES = _PACKAGE / "shipped" if (_PACKAGE / "shipped").is_dir() else _PACKAGE.parents[1]
 CONFIG = "config.yaml"  # of a user's own project
 SHARED = Path("config") / CONFIG  # of a clone: the Snakefile reads it

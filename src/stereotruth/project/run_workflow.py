@@ -26,7 +26,7 @@ from .project import (
 TARGETS = {
     "tiles/<City>": "the benchmark tiles of a city (without a target: of all cities)",
     "dataset": "the tiles of all cities, in the layout of the published dataset",
-    "originals": "crops of the original images with corrected RPCs (dataset.originals)",
+    "originals": "crops of the original images with corrected cameras (dataset.originals)",
     "verify": "all tiles, held against the checksums of their manifests",
     "report": "the pages of all cities; results/report/<City>/index.html that of one",
     "evaluate": "figures from the images, and against the exact truth of synthetic cities",

@@ -31,28 +31,46 @@ Sun = tuple[float, float]  # azimuth from north over east, elevation, degrees
 # Files that are read with an image, by GDAL's names: after its whole name, after its stem; and of
 # DIMAP deliveries RPC_*.XML, of both views.
 AFTER_NAME = (".msk", ".aux.xml", ".ovr", ".msk.ovr", ".imd", ".rpb")
-AFTER_STEM = ("_rpc.txt", ".rpb", ".imd", ".rpc", ".aux", ".aux.xml", ".tab", ".wld", ".rrd")
+AFTER_STEM = (
+    "_rpc.txt",
+    ".rpb",
+    ".imd",
+    ".xml",
+    ".rpc",
+    ".aux",
+    ".aux.xml",
+    ".tab",
+    ".wld",
+    ".rrd",
+)
 ANYWHERE = re.compile(r"rpc_.*\.xml", re.DOTALL)
-# Names of suppliers (GaoFen-7, ZY-3, Cartosat, ALOS PRISM) for the views along the track, and the
-# plain words.
+# Names of suppliers for the views along the track (GaoFen-7, ZY-3; Cartosat-1 has BANDA aft, BANDF
+# fore; ALOS PRISM has ALPSMB and ALPSMF), and the plain words.
 VIEWS = (
-    ("left", re.compile(r"(?<![A-Za-z])(BWD|BACKWARD|LEFT)(?![A-Za-z])", re.IGNORECASE)),
-    ("right", re.compile(r"(?<![A-Za-z])(FWD|FORWARD|RIGHT)(?![A-Za-z])", re.IGNORECASE)),
+    ("left", re.compile(r"(?<![A-Z])(BWD|BACKWARD|LEFT|BANDA|ALPSMB)(?![A-Z])", re.IGNORECASE)),
+    ("right", re.compile(r"(?<![A-Z])(FWD|FORWARD|RIGHT|BANDF|ALPSMF)(?![A-Z])", re.IGNORECASE)),
 )
 # What lies beside the images that are wanted: bands of colour, browse images.
 OTHERS = re.compile(
     r"(?<![A-Za-z])(MUX|MSS?|MULTI|BROWSE|THUMB\w*|QUICKLOOK|PREVIEW|ICON)(?![A-Za-z])",
     re.IGNORECASE,
 )
-TAGS = {  # of XML (DIMAP of Pléiades and SPOT, versions 1 and 2; GaoFen products), in lower case
-    "time": ("imaging_time", "centertime", "scenecentertime", "starttime"),
-    "date": ("imaging_date",),
-    "azimuth": ("sun_azimuth", "solarazimuth", "sunazimuth"),
-    "elevation": ("sun_elevation", "solarelevation", "sunelevation"),
-    "zenith": ("solarzenith", "sunzenith"),
-}
 IMD_TIME = ("firstLineTime", "TLCTime", "earliestAcqTime")
 IMD_SUN = (("meanSunAz", "meanSunEl"), ("sunAz", "sunEl"))
+TAGS = {  # of XML in lower case: DIMAP 1 to 3 (Airbus), GaoFen products, and IMD as XML (Vantor)
+    "time": (
+        "imaging_time",
+        "centertime",
+        "scenecentertime",
+        "firstlinetime",
+        "starttime",
+        "tlctime",
+    ),
+    "date": ("imaging_date",),
+    "azimuth": ("sun_azimuth", "solarazimuth", "sunazimuth", "meansunaz", "sunaz"),
+    "elevation": ("sun_elevation", "solarelevation", "sunelevation", "meansunel", "sunel"),
+    "zenith": ("solarzenith", "sunzenith"),
+}
 
 MAX_BYTES = 5_000_000  # of a file beside an image
 MOST_FILES = 200  # beside an image that are looked into
@@ -181,7 +199,7 @@ def _of_imd(text: str, place: Place) -> Acquisition:
 
 
 def _of_xml(text: str, place: Place) -> Acquisition:
-    """DIMAP and GaoFen products. The middle of three incidences (top, centre, bottom) counts."""
+    """DIMAP, GaoFen, Vantor. The middle of three incidences (top, centre, bottom) counts."""
     values: dict[str, list[str]] = {}
     for element in ElementTree.fromstring(text).iter():
         if element.text and element.text.strip():
@@ -243,6 +261,7 @@ FORMS = (
         _of_xml,
         lambda file, image: file.startswith("dim_") and image.startswith(f"img_{file[4:]}"),
     ),
+    Form(".dim", _of_xml),  # DIMAP 1 (SPOT 5): METADATA.DIM names its image
     Form(".json", _of_stac),
     Form(".geojson", _of_stac),
 )

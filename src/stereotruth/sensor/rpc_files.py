@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from rasterio.errors import RasterioError
 
@@ -17,7 +19,7 @@ from .rpc import RPC, SCALARS, VECTORS
 log = logging.getLogger("stereotruth")
 
 MAX_BYTES = 1_000_000  # of an RPC file; they have some 8000
-UNITS = {"line": "pixels", "samp": "pixels", "lat": "degrees", "long": "degrees"}
+MAX_XML_BYTES = 5_000_000  # which has orbits and attitudes besides
 RPB_NAMES = {name.replace("_off", "offset").replace("_", ""): name for name in SCALARS}
 RPB_NAMES |= {name.removesuffix("f").replace("_", ""): name for name in VECTORS}
 # Possessive (++): a run of letters or blanks is looked at once, however long it is.
@@ -80,9 +82,38 @@ def _parse_rpb(text: str) -> dict[str, Any]:
     return found
 
 
+def _parse_xml(text: str) -> dict[str, Any]:
+    """Fields of an XML of Vantor (DigitalGlobe, Maxar) or DIMAP, whatever its namespaces.
+
+    Pixels count from 0 at the centre of the first one in Vantor's files and in DIMAP 3 (Pléiades
+    Neo), and from 1 in DIMAP 2 (Pléiades, SPOT 6 and 7). Of an XML without an RPC there are none.
+    """
+    root = ElementTree.fromstring(text)
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+    found: dict[str, Any] = {}
+    if (vantor := root.find(".//RPB")) is not None:
+        if (vantor.findtext("SPECID") or "").strip().upper() == "RPC00A":
+            raise ValueError("SPECID is RPC00A, whose terms have another order than RPC00B's")
+        for element in vantor.iter():
+            name = RPB_NAMES.get(element.tag.lower())
+            if name:
+                read = _numbers if name in VECTORS else _number
+                _put(found, name, read(element.text or ""))
+    elif (dimap := root.find(".//Global_RFM")) is not None:
+        parts = (dimap.find(name) for name in ("GroundtoImage_Values", "Inverse_Model"))
+        inverse = next(part for part in (*parts, dimap) if part is not None)
+        lines = [*inverse.iter(), *dimap.iterfind("RFM_Validity/*")]
+        found = _parse_text("\n".join(f"{one.tag}: {one.text or ''}" for one in lines))
+        if inverse.tag != "GroundtoImage_Values":
+            found |= {name: found[name] - 1.0 for name in ("line_off", "samp_off")}
+    return found
+
+
 # What follows an image's stem in the name of its RPC file, in any case of the letters, and how that
 # is read; the first that is there counts, in GDAL's order.
 FORMS = {".rpb": _parse_rpb, "_rpc.txt": _parse_text}
+_AIRBUS = re.compile(r"img_(.+)_r1c1")  # its RPC is rpc_X.xml; of other tiles it would be moved
 
 
 def rpc_file(image: str | Path) -> Path:
@@ -93,19 +124,33 @@ def rpc_file(image: str | Path) -> Path:
     return next(filter(None, found), image)
 
 
+def _of_xml(image: Path) -> dict[str, Any]:
+    """Fields of the first XML beside an image that has an RPC of it; none of them may be there."""
+    stem = image.stem.lower()
+    tile = _AIRBUS.fullmatch(stem)
+    names = {path.name.lower(): path for path in sorted(image.parent.iterdir(), reverse=True)}
+    for name in (f"{stem}.xml", f"rpc_{tile[1]}.xml" if tile else ""):
+        if name in names and names[name].stat().st_size <= MAX_XML_BYTES:
+            with suppress(ElementTree.ParseError):
+                if found := _parse_xml(names[name].read_text(encoding="utf-8-sig")):
+                    return found
+    return {}
+
+
 def _fields_of(image: Path, source: Path) -> dict[str, Any]:
     """The fields of an RPC file, or of the metadata of an image that is its own source."""
     if source == image:
         with open_raster(image) as dataset:
             tags = dataset.tags(ns="RPC")
-        if not tags:
+        text = "\n".join(f"{key}: {value}" for key, value in tags.items())
+        if not (found := _parse_text(text) if tags else _of_xml(image)):
             raise InputError(
                 "image has no RPC metadata",
                 file=image,
                 remedy=f"put {image.stem}_RPC.TXT or {image.stem}.rpb beside it, or an RPC "
                 "tag into the TIFF",
             )
-        return _parse_text("\n".join(f"{key}: {value}" for key, value in tags.items()))
+        return found
     if (size := source.stat().st_size) > MAX_BYTES:
         raise ValueError(f"{size} bytes are more than any RPC has")
     parse = next(FORMS[ending] for ending in FORMS if source.name.lower().endswith(ending))
@@ -115,8 +160,9 @@ def _fields_of(image: Path, source: Path) -> dict[str, Any]:
 def read_rpc(image: str | Path) -> RPC:
     """The RPC of an image file: from a file of :data:`FORMS` beside it, or its metadata.
 
-    Metadata are those that GDAL reads, above all the TIFF tag RPCCoefficientTag (50844). A file
-    beside the image goes before the tag, as in GDAL, so that a better RPC can be put there.
+    Metadata are those that GDAL reads, above all the TIFF tag RPCCoefficientTag (50844), else an
+    XML of Vantor or Airbus that GDAL does not find. A file beside the image goes before the tag, as
+    in GDAL, so that a better RPC can be put there.
 
     Raises InputError, naming the file, if there is none or it cannot be used.
     """
@@ -139,17 +185,14 @@ def read_rpc(image: str | Path) -> RPC:
             remedy="get the RPC again from the image's supplier; 10 offsets and scales and four "
             "times 20 coefficients in RPC00B order are needed",
         ) from error
-    log.info("RPC of %s from %s", image.name, "its tags" if source == image else source.name)
+    log.info("RPC of %s from %s", image.name, "its metadata" if source == image else source.name)
     return rpc
 
 
 def rpc_text(rpc: RPC) -> str:
-    """``_RPC.TXT`` with all digits."""
+    """``_RPC.TXT`` with all digits and, as GDAL and rpcm want it, without units."""
     values = rpc.to_dict()
-    lines = [
-        f"{name.upper()}: {values[name]!r} {UNITS.get(name.split('_')[0], 'meters')}"
-        for name in SCALARS
-    ]
+    lines = [f"{name.upper()}: {values[name]!r}" for name in SCALARS]
     for name in VECTORS:
         lines += [f"{name.upper()}_{k}: {value!r}" for k, value in enumerate(values[name], 1)]
     return "\n".join(lines) + "\n"

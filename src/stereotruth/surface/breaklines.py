@@ -8,8 +8,13 @@ in (offset, slope), see :mod:`.feasible_lines`. The breakline lies within the sp
 triangle is cut there (:mod:`.surface`): what lies clearly on one side belongs to that
 surface's plane, the strip in between may hold any height between both.
 
-All follows from the points up to BREAKLINE_REACH around a triangle, in an order of theirs that no
-window changes. No image takes part, so that labels do not favour what images show well.
+Of the triangles in a square of two spacings the first one that is cut finds the breakline, and the
+others take it where it cuts them, too, and their own vertices lie where it says: four of five
+triangles along a wall would find the same.
+
+All follows from the points up to BREAKLINE_REACH around the triangles of a square, in an order of
+theirs that no window changes. No image takes part, so that labels do not favour what images show
+well.
 """
 
 from __future__ import annotations
@@ -278,17 +283,69 @@ def _mean_line(
     return p, q, mean_a / norm + p * centre.off_x + q * centre.off_y, width
 
 
+@inlined
+def _cuts(
+    planed: Planed, corner: Corners, centre: Centroid, line: tuple[float, float, float, float]
+) -> bool:
+    """Whether vertices of a triangle lie to both sides of a ``line`` (p, q, r, w)."""
+    low, high = np.inf, -np.inf
+    for w in corner:
+        s = line[0] * float(planed.x[w] - centre.x) + line[1] * float(planed.y[w] - centre.y)
+        low, high = min(low, s - line[2]), max(high, s - line[2])
+    return low < 0.0 < high
+
+
+class _Shared(NamedTuple):
+    """Of the triangle that has found a breakline: its ``planes`` [2, 3] at its centroid, ``sums``
+    [2, 5] of the points on them, ``whole`` [4]: their vertices, least and greatest height."""
+
+    planes: Floats
+    sums: Floats
+    whole: Ints
+
+
+@inlined
+def _keep(
+    planed: Planed,
+    a: int,
+    centre: Centroid,
+    line: tuple[float, float, float, float],
+    shared: _Shared,
+    limits: _Limits,
+    out: Breaklines,
+    t: int,
+) -> None:
+    """The breakline of triangle ``t``, whose first vertex is ``a``, to ``out``; ``centre``: of the
+    triangle that has found it."""
+    dx, dy = float(planed.x[a] - centre.x), float(planed.y[a] - centre.y)
+    p, q, r, width = line
+    out.line[t, 0], out.line[t, 1] = p, q
+    out.line[t, 2], out.line[t, 3] = r - p * dx - q * dy, width
+    for side in range(2):
+        count, gx, gy = shared.sums[side, 0], shared.planes[side, 1], shared.planes[side, 2]
+        level = shared.planes[side, 0] + shared.sums[side, 3] / count
+        out.planes[t, 3 * side] = level - gx * (centre.off_x - dx) - gy * (centre.off_y - dy)
+        out.planes[t, 3 * side + 1], out.planes[t, 3 * side + 2] = gx, gy
+        variance = (shared.sums[side, 4] + limits.prior) / (count + 1.0)
+        out.variance[t, side] = max(variance, limits.least)
+        out.anchor[t, side] = shared.whole[side]
+    out.planes[t, 6], out.planes[t, 7] = shared.whole[2], shared.whole[3]
+
+
 @kernel
 def _fill_breaklines(
     planed: Planed,
     corner: Steps,
+    square: Ints,
+    order: Ints,
     radius: Floats,
     points: StepPoints,
     limits: _Limits,
     out: Breaklines,
 ) -> None:
     """The breakline of each triangle [m, 3] of circumradius ``radius`` [m], to ``out`` (eq. 4 to 6
-    of docs/explanation/surface.md)."""
+    of docs/explanation/surface.md), in an ``order`` [m] in which those of a ``square`` [m] follow
+    each other."""
     # Made here, the compiler knows their shapes: a fifth of the time.
     near = Nearby(
         np.empty(MOST_STEP_POINTS, np.int32), np.empty(MOST_STEP_POINTS), np.empty(MOST_STEP_POINTS)
@@ -312,16 +369,25 @@ def _fill_breaklines(
         np.empty(RINGS + 1, np.int32),
     )
     planes, sums = np.empty((2, 3)), np.empty((2, 5))
+    shared = _Shared(np.empty((2, 3)), np.empty((2, 5)), np.empty(4, np.int64))
     spacing, residual = limits.spacing, limits.residual
     reach, width = BREAKLINE_REACH * spacing, BAND_SPACINGS * spacing
     band = Band(reach, width, SLACK_CELLS * PART, spacing)
     x, y = planed.x, planed.y
-    for t in range(len(corner)):
+    lead, normal, s = Centroid(0, 0, 0.0, 0.0), (0.0, 0.0), 0
+    leads, of_square = False, square[0] if square.size else 0
+    for t in order:
         out.line[t, 3] = np.nan
         a, b, c = abc = corner[t, 0], corner[t, 1], corner[t, 2]
         area = float((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]))
         if area < 2.0 * SMALLEST_AREA * spacing * spacing:
             continue
+        if leads and of_square == square[t]:
+            line = _mean_line(planed, abc, lead, normal, polygons, s)
+            fits = line[3] <= WIDEST_STRIP * spacing and _cuts(planed, abc, lead, line)
+            if fits and _fits_corners(planed, abc, lead, shared.planes, line, residual):
+                _keep(planed, a, lead, line, shared, limits, out, t)
+                continue
         ox = float(x[b] - x[a] + x[c] - x[a]) / 3.0
         oy = float(y[b] - y[a] + y[c] - y[a]) / 3.0
         centre = Centroid(x[a], y[a], ox, oy)
@@ -333,7 +399,8 @@ def _fill_breaklines(
         length = np.sqrt(nx * nx + ny * ny)
         if length == 0.0:
             continue
-        normal = nx / length, ny / length
+        leads = False
+        lead, normal = centre, (nx / length, ny / length)
         extent = 4.0 * radius[t]
         m, least_h, most_h = points_of_sides(
             points, centre, planes, normal, reach, extent + width, spacing, residual, around, sides
@@ -344,17 +411,15 @@ def _fill_breaklines(
             continue
         if not _fits_corners(planed, abc, centre, planes, line, residual):
             continue
-        for k in range(4):
-            out.line[t, k] = line[k]
+        leads, of_square = True, square[t]
         for side in range(2):
-            level, gx, gy = planes[side, 0], planes[side, 1], planes[side, 2]
-            level += sums[side, 3] / sums[side, 0]
-            out.planes[t, 3 * side] = level - gx * ox - gy * oy
-            out.planes[t, 3 * side + 1], out.planes[t, 3 * side + 2] = gx, gy
-            variance = (sums[side, 4] + limits.prior) / (sums[side, 0] + 1.0)
-            out.variance[t, side] = max(variance, limits.least)
-        out.planes[t, 6], out.planes[t, 7] = least_h, most_h
-        out.anchor[t, 0], out.anchor[t, 1] = low, top
+            for k in range(3):
+                shared.planes[side, k] = planes[side, k]
+            for k in range(5):
+                shared.sums[side, k] = sums[side, k]
+        shared.whole[0], shared.whole[1] = low, top
+        shared.whole[2], shared.whole[3] = least_h, most_h
+        _keep(planed, a, centre, line, shared, limits, out, t)
 
 
 def breaklines(
@@ -381,9 +446,16 @@ def breaklines(
     out = Breaklines(
         np.empty((size, 4)), np.empty((size, 8)), np.empty((size, 2)), np.empty((size, 2), np.int32)
     )
+    corner = triangles.corner[chosen]
+    side_lon, side_lat = (scale.shared_cells * cell for cell in scale.cell)
+    first = corner[:, 0]
+    row, col = vertices.lat_q[first] // side_lat, vertices.lon_q[first] // side_lon
+    square = (row << 32) + col
     _fill_breaklines(
         Planed(vertices.x, vertices.y, vertices.h_q, slopes),
-        triangles.corner[chosen],
+        corner,
+        square,
+        np.argsort(square, kind="stable"),
         triangles.radius[chosen],
         step_points(vertices, slopes, beside_step),
         _Limits(scale.spacing, residual, *variances),

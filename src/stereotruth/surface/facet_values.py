@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, kernel
 from ..core.numerics.geometry import corner_shares, plane_slopes
 from .vertices import Vertices
 
@@ -44,8 +44,8 @@ class PixelValues(NamedTuple):
         return cls(*values, classes, np.zeros(shape, np.uint16))
 
 
-@inner
-def triple(values: Floats, t: Steps | tuple) -> tuple[float, float, float]:
+@inlined
+def triple(values: Floats, t: tuple) -> tuple[float, float, float]:
     """Of a triangle's three corners ``t``."""
     return values[t[0]], values[t[1]], values[t[2]]
 
@@ -61,14 +61,15 @@ def interpolate(
     h, count, classes, days = vertices.h_q, vertices.count, vertices.surface_class, vertices.day
     slope, variance, height, rise = out.slope, out.variance, out.height, out.rise
     surface_class, day = out.surface_class, out.day
+    x_left, y_left, x_right = xy[0], xy[1], xy[2]
     rows, cols = index.shape
     for j in range(rows):
         for i in range(cols):
             t = index[j, i]
             if t < 0:
                 continue
-            v = corner[t]
-            x, y, xr = triple(xy[0], v), triple(xy[1], v), triple(xy[2], v)
+            v = corner[t, 0], corner[t, 1], corner[t, 2]
+            x, y, xr = triple(x_left, v), triple(y_left, v), triple(x_right, v)
             slope[0, j, i], slope[1, j, i] = plane_slopes(
                 x, y, (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
             )

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from ..core.job import progress
 from ..core.kernels import kernel
 from ..core.products.files import atomic_file, atomic_folder, link, sealed
+from ..core.products.grids import Strip
 from ..core.products.making import FileLock, marks_of_inputs, refuse_replaced
 from ..core.products.provenance import describe, digest
 from ..core.products.resumable_grids import Ledger
@@ -221,6 +222,7 @@ def make_surface(
     workers: int = 1,
     made_of: Mapping[str, str] | None = None,
     code: str = "",
+    strip: Strip | None = None,
 ) -> None:
     """Write the surface of the points of stores where images show the ground (see
     :mod:`.surface_store`).
@@ -228,8 +230,8 @@ def make_surface(
     ``cell``: (lon, lat) size of a ground cell, lattice steps. ``ground``: by default all that has
     points. ``blocks_at_once`` along the side of a group, by default
     :func:`group_blocks`; ``made_of``, ``code``:
-    digests of other input and of the source, for the provenance. Blocks that an earlier call has
-    left, made of the same, are taken over.
+    digests of other input and of the source, for the provenance. ``strip``: make its groups only,
+    and no store. Groups that an earlier call has left, made of the same, are taken over.
 
     Raises InputError where the images show no point.
     """
@@ -248,9 +250,11 @@ def make_surface(
         heights = float(bounds[:, 4].min()), float(bounds[:, 5].max())
         refuse_apart(box, ground.box(heights), heights, stores[0].path)
     groups = _groups(numbers, blocks_at_once or group_blocks(scale, side))
+    if strip:
+        groups = strip.share(groups, list(map(len, groups)))
     lock, done = FileLock(folder / "lock"), Ledger(folder / "done")
     try:
-        lock.take(out)
+        lock.take(out, shared=strip is not None)
 
         def one(group: Group) -> None:
             parts = maker.parts(group)
@@ -261,6 +265,8 @@ def make_surface(
         with ThreadPoolExecutor(workers) as pool:
             for _ in progress(pool.map(one, groups), len(groups), "parts of the surface"):
                 pass
+        if strip:
+            return
         rows = {group: done.get(_name(group)).result for group in groups}
         table = BytesIO()
         np.save(table, table_of([row for of_group in rows.values() for row in of_group]))

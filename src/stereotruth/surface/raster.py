@@ -24,7 +24,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.kernels import inner, kernel
+from ..core.kernels import inlined, kernel
 from ..core.numerics.geometry import plane_slopes, row_span
 from ..epipolar.window_sums import SURFACE_PX
 from ..lidar.lattice import LATTICE_M
@@ -84,14 +84,14 @@ class _Prisms(NamedTuple):
     h: Ints
 
 
-@inner
+@inlined
 def _misses(low: float, high: float, first: int, count: int) -> bool:
     """Whether no centre of the ``count`` rows or columns from the ``first`` one on lies in a range,
     as in those of most triangles."""
     return max(np.ceil(low), first) > min(np.floor(high), first + count - 1)
 
 
-@inner
+@inlined
 def _raster_triangle(
     x: tuple,
     y: tuple,
@@ -143,19 +143,21 @@ def _raster_facets(
     number.
     """
     rows, cols = z_buffer.shape
+    x_left, y_left, x_right = xy[0], xy[1], xy[2]
     for t in range(len(corner)):
-        y = triple(xy[1], corner[t])
+        v = corner[t, 0], corner[t, 1], corner[t, 2]
+        y = triple(y_left, v)
         if _misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), first[0], rows):
             continue
-        x = triple(xy[0], corner[t])
+        x = triple(x_left, v)
         if _misses(min(x[0], x[1], x[2]), max(x[0], x[1], x[2]), first[1], cols):
             continue
-        xr = triple(xy[2], corner[t])
+        xr = triple(x_right, v)
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
         _raster_triangle(x, y, d, first, t, z_buffer, index)
 
 
-@inner
+@inlined
 def _may_hide(
     left: float,
     right: float,
@@ -181,7 +183,7 @@ def _may_hide(
     return False
 
 
-@inner
+@inlined
 def _hide_right(x: tuple, y: tuple, d: tuple, pixels: RightPixels, hidden: Bools) -> None:
     """Marks the pixels that a triangle covers in the right view, and whose ``limit`` it exceeds."""
     first, width, start = pixels.first, pixels.width, pixels.start
@@ -219,16 +221,18 @@ def _hide_by_facets(xy: Floats, corner: Steps, pixels: RightPixels, hidden: Bool
     """Marks the pixels that triangles hide from the right camera (eq. 8 of
     docs/explanation/surface.md)."""
     rows = (pixels.start.size - 1) // pixels.width
+    x_left, x_right, y_right = xy[0], xy[2], xy[3]
     for t in range(len(corner)):
-        y = triple(xy[3], corner[t])
+        v = corner[t, 0], corner[t, 1], corner[t, 2]
+        y = triple(y_right, v)
         if _misses(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), pixels.first[0], rows):
             continue
-        x, xr = triple(xy[0], corner[t]), triple(xy[2], corner[t])
+        x, xr = triple(x_left, v), triple(x_right, v)
         d = (x[0] - xr[0], x[1] - xr[1], x[2] - xr[2])
         _hide_right(xr, y, d, pixels, hidden)
 
 
-@inner
+@inlined
 def _at_heights(prisms: _Prisms, t: int, axis: int, out: Floats) -> None:
     """Positions [6] of a prism's corners along an axis, px: first those at its top."""
     low, high = prisms.height_range[t, 0], prisms.height_range[t, 1]
@@ -239,7 +243,7 @@ def _at_heights(prisms: _Prisms, t: int, axis: int, out: Floats) -> None:
         out[3 + k] = at + (low - prisms.h[v]) * rise
 
 
-@inner
+@inlined
 def _range(values: Floats) -> tuple[float, float]:
     """Least and greatest of a prism's corners."""
     low, high = values[0], values[0]
@@ -248,7 +252,7 @@ def _range(values: Floats) -> tuple[float, float]:
     return low, high
 
 
-@inner
+@inlined
 def _faces_seen(x: Floats, y: Floats, d: Floats, faces: Steps) -> int:
     """Triangles [n, 3] of a prism's corners [6] that a camera sees from outside, to ``faces``
     [7, 3]; their number. ``x``, ``y``: positions in its image, ``d``: disparity.
@@ -288,7 +292,8 @@ def _raster_prisms(prisms: _Prisms, first: tuple[int, int], z_buffer: Floats) ->
         _at_heights(prisms, t, 2, xr)
         for k in range(6):
             d[k] = x[k] - xr[k]
-        for face in faces[: _faces_seen(x, y, d, faces)]:
+        for k in range(_faces_seen(x, y, d, faces)):
+            face = faces[k, 0], faces[k, 1], faces[k, 2]
             corners = triple(x, face), triple(y, face), triple(d, face)
             _raster_triangle(*corners, first, t, z_buffer, any_prism)
 
@@ -317,7 +322,8 @@ def _hide_by_prisms(prisms: _Prisms, pixels: RightPixels, hidden: Bools) -> None
             d[k] = x[k] - xr[k]
         if not _may_hide(low, high, top, bottom, _range(d)[1], pixels, hidden):
             continue
-        for face in faces[: _faces_seen(xr, y, d, faces)]:
+        for k in range(_faces_seen(xr, y, d, faces)):
+            face = faces[k, 0], faces[k, 1], faces[k, 2]
             _hide_right(triple(xr, face), triple(y, face), triple(d, face), pixels, hidden)
 
 

@@ -31,6 +31,8 @@ SWEPT_RADIUS = 3.0
 SWEPT_CELLS = 32
 # Spacings of points along a breakline, to either side of a triangle, that determine it.
 BREAKLINE_REACH = 12.0
+# Spacings of points along the side of a square, whose triangles share breaklines.
+SHARED_SPACINGS = 2.0
 # Spacings of points around a vertex of a rough surface that decide whether it is a top.
 ROUGH_REACH = 2.2
 # Even ground: one vertex for each square of so many cells (two pixels) along each axis.
@@ -128,6 +130,11 @@ class SurfaceScale:
         return max(SWEPT_RADIUS * self.facet_radius, float(SWEPT_CELLS * PART))
 
     @property
+    def shared_cells(self) -> int:
+        """Side of the squares whose triangles share breaklines."""
+        return int(np.ceil(SHARED_SPACINGS * self.spacing / PART))
+
+    @property
     def halo_cells(self) -> int:
         """Cells around a place whose points determine all facets there, so that these have the same
         bytes in every window.
@@ -135,15 +142,15 @@ class SurfaceScale:
         The vertices of a triangle lie within two radii of any place in its circumcircle. A label
         follows from its facet, its neighbours and theirs (noise), the neighbours of these
         (support), the triangles that share a vertex with them (planes), and again (slopes): six
-        steps of two radii. A breakline follows from the points up to BREAKLINE_REACH around and
-        their planes (two radii more); a rough surface from six steps, and its labels from
-        ``rough_halo_cells`` around. Which vertices there are follows from the squares around
-        (:func:`.vertices.even_ground`).
+        steps of two radii. A breakline follows from the points up to BREAKLINE_REACH around any
+        triangle of a square and their planes (two radii more); a rough surface from six steps, and
+        its labels from ``rough_halo_cells`` around. Which vertices there are follows from the
+        squares around (:func:`.vertices.even_ground`).
         """
         facet, swept = self.facet_radius, self.swept_radius
         halo = max(12 * facet, 2 * swept) + BREAKLINE_REACH * self.spacing + 2 * facet
         halo = max(halo, 18 * facet + ROUGH_REACH * self.spacing)
-        return int(np.ceil(halo / PART)) + EVEN_REACH + 2
+        return int(np.ceil(halo / PART)) + self.shared_cells + EVEN_REACH + 2
 
     @property
     def rough_halo_cells(self) -> int:
@@ -156,6 +163,7 @@ class SurfaceScale:
         """Parts of a cell between a place of a triangle and any point that determines heights
         there."""
         breakline = BREAKLINE_REACH * self.spacing + 2.0 * self.facet_radius
+        breakline += np.sqrt(2.0) * PART * self.shared_cells
         return max(breakline, 2.0 * self.swept_radius)
 
 

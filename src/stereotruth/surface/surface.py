@@ -436,21 +436,22 @@ def ground_surface(
     triangles = triangulate(vertices.x, vertices.y, scale.swept_radius)
     planes = facets(vertices, triangles, scale)
     corner = triangles.corner
-    wanted = np.ones(len(corner), np.bool_)
+    wanted = fitted = np.ones(len(corner), np.bool_)
     near_undecided = _near_undecided(corner, planes.is_facet, vertices.x.size)
     if core is not None:
         own = core.holds(vertices)
         wanted = own.take(corner[:, 0])
+        fitted = core.holds(vertices, scale.shared_cells).take(corner[:, 0])
         near_undecided &= core.holds(vertices, scale.rough_halo_cells)
     tops = rough_tops(vertices, near_undecided, scale)
     if core is not None:
         tops = tops.taken(np.flatnonzero(own.take(tops.corner[:, 0])))
 
-    to_cut = np.flatnonzero(~planes.is_facet & wanted & (triangles.radius <= scale.facet_radius))
+    to_cut = np.flatnonzero(~planes.is_facet & fitted & (triangles.radius <= scale.facet_radius))
     lines = breaklines(
         vertices, triangles, planes.slopes, planes.is_facet, to_cut, scale, height_variances()
     )
-    lined = np.flatnonzero(~np.isnan(lines.line[:, 3]))
+    lined = np.flatnonzero(~np.isnan(lines.line[:, 3]) & wanted[to_cut])
     to_cut, lines = (
         to_cut[lined],
         type(lines)(*(values.take(lined, axis=0) for values in lines)),

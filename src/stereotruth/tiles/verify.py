@@ -19,6 +19,7 @@ log = logging.getLogger("stereotruth")
 LOOSE = (
     *("manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE, STATUS_COLOURS_FILE),
     *("README.md", "croissant.json", "stac/collection.json", "stac/rpc/*"),
+    *("satnerf/pts3d.npy", "colmap/frame.json", "colmap/sparse/0/*.txt"),
 )
 
 

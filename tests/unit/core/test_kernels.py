@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -159,6 +161,40 @@ def test_an_edit_of_what_a_kernel_calls_compiles_it_and_another_edit_does_not(ru
     fields = ("made/uses.py", "slope: float\n    level: float", "level: float\n    slope: float")
     assert result(run(fields)) == (45.0, True)  # fields are known by number
     assert result(run()) == (18.0, False)  # taken back
+
+
+def test_the_place_of_compiled_code_is_claimed_for_what_is_kept_alone(monkeypatch) -> None:
+    """Else processes would wait while one compiles what its kernel calls."""
+    claims = []
+    monkeypatch.setattr(kernels, "_claim", lambda: claims.append(True))
+    for function in (shifted, summed.py_func):
+        compiled = SimpleNamespace(
+            kind="numba:compile", data={"dispatcher": SimpleNamespace(py_func=function)}
+        )
+        kernels._compilation.on_end(compiled)
+        assert bool(claims) == (function is summed.py_func)
+
+
+@pytest.mark.slow
+def test_a_wheel_brings_kernels_along_for_all_processors_of_the_target(run, tmp_path) -> None:
+    """Whatever the folder in which the package is installed, and the one where it keeps them."""
+    assert result(run()) == (18.0, True)
+    (digest,) = (tmp_path / "kernels").glob("*/")
+    shipped, elsewhere = tmp_path / "shipped", tmp_path / "elsewhere"
+    (tmp_path / "kernels").rename(shipped)
+    for name in FILES:
+        (elsewhere / name).parent.mkdir(exist_ok=True, parents=True)
+        shutil.move(tmp_path / name, elsewhere / name)
+    main = elsewhere / "main.py"
+    ship = (
+        f"from stereotruth.core import kernels\nkernels.SHIPPED = kernels.Path({str(shipped)!r})\n"
+    )
+    main.write_text(ship + main.read_text())
+    command = [sys.executable, "main.py", "float64"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(elsewhere), "PYTHONDONTWRITEBYTECODE": "1"}
+    text = subprocess.check_output(command, cwd=elsewhere, env=environment, text=True)
+    assert text.split() == ["18.0", "18.0"]  # and not a word of compiling
+    assert (elsewhere / "kernels" / digest.name).is_dir()
 
 
 @pytest.mark.slow

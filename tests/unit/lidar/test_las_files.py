@@ -101,7 +101,9 @@ def test_missing_and_empty_files(tmp_path) -> None:
     refused(tmp_path / "empty.laz", "announces 0 points")
 
 
-@pytest.mark.parametrize(("pdrf", "version"), [(1, "1.2"), (8, "1.4")])
+@pytest.mark.parametrize(
+    ("pdrf", "version"), [(1, "1.2"), (4, "1.3"), (8, "1.4"), (9, "1.4"), (6, "1.5")]
+)
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_good_files_pass(tmp_path, pdrf, version, suffix) -> None:
     file = tmp_path / f"a.{suffix}"

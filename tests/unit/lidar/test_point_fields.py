@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
+import laspy
 import numpy as np
 import pytest
 
@@ -34,6 +35,20 @@ def test_days_follow_from_absolute_times(tmp_path, name, pdrf, first):
     found = ingest(tmp_path / name, tmp_path / "s.points", acquired=catalogue)["acquired"]
     last = f"{first[:8]}{int(first[8:]) + 5:02d}"
     assert found == {"start": first, "end": last, "by": "GPS time of the points"}
+
+
+def test_las_1_5_counts_times_from_an_offset_of_its_own(tmp_path):
+    times = np.linspace(seconds("2025-03-01"), seconds("2025-03-03"), 3000)
+    write_las(tmp_path / "a.las", 3000, version="1.5", gps_time=times, absolute=True)
+    las = laspy.read(tmp_path / "a.las")
+    las.gps_time = times - 500e6
+    las.header.global_encoding.gps_time_offset = True
+    las.header.gps_time_offset = 1500
+    las.write(tmp_path / "b.laz")
+    found = [ingest(tmp_path / name, tmp_path / f"{name}.points") for name in ("a.las", "b.laz")]
+    assert found[0]["acquired"]["start"] == "2025-03-01"
+    assert found[1]["acquired"] == found[0]["acquired"]
+    assert found[1]["strips"] == found[0]["strips"]
 
 
 @pytest.mark.parametrize(("time", "absolute"), [(3e5, False), (0.0, True)])

@@ -21,6 +21,8 @@ from stereotruth.sensor.deliveries import (
     toward_sun,
 )
 
+from ...synthetic.rpc_texts import vantor_text
+
 PLACE = 115.4, 30.2
 TIME = datetime(2020, 10, 25, 3, 12, 45, tzinfo=UTC)
 SUN = sun_over(TIME, *PLACE)
@@ -60,6 +62,42 @@ def image(tmp_path):
 def test_what_deliveries_say(image, name, text):
     image.with_name(name).write_text(text)
     assert read_acquisition(image, PLACE) == Acquisition(TIME, (161.5, 44.9), name)
+
+
+@pytest.mark.parametrize("namespace", ["", "urn:of:a:supplier"])
+def test_vantor_says_it_in_xml(image, namespace):
+    image.with_name("one.XML").write_text(vantor_text({}, namespace))
+    assert read_acquisition(image, PLACE) == Acquisition(TIME, (161.5, 44.9), "one.XML")
+
+
+def test_spot_5_says_it_in_dimap_1(tmp_path):
+    image = tmp_path / "IMAGERY.TIF"
+    image.write_bytes(b"")
+    source = (
+        "<IMAGING_DATE>2020-10-25</IMAGING_DATE><IMAGING_TIME>03:12:45</IMAGING_TIME>"
+        + ANGLES.format(161.5, 44.9)
+    )
+    (tmp_path / "METADATA.DIM").write_text(
+        f"<Dimap_Document><Scene_Source>{source}</Scene_Source>"
+        '<DATA_FILE_PATH href="IMAGERY.TIF"/></Dimap_Document>'
+    )
+    assert read_acquisition(image, PLACE) == Acquisition(TIME, (161.5, 44.9), "METADATA.DIM")
+
+
+@pytest.mark.parametrize(
+    ("name", "view"),
+    [
+        ("GF7_DLC_E108_BWD", "left"),
+        ("BANDA", "left"),
+        ("BANDF", "right"),
+        ("IMG-01-ALPSMB011112970", "left"),
+        ("IMG-02-ALPSMF011112970", "right"),
+        ("IMG-03-ALPSMN011112970", None),
+        ("BANDAGE", None),
+    ],
+)
+def test_names_of_views(name, view):
+    assert next((view for view, words in deliveries.VIEWS if words.search(name)), None) == view
 
 
 def test_airbus_names_its_files_by_the_product(tmp_path):

@@ -113,6 +113,30 @@ def test_where_an_rpc_comes_from(tmp_path: Path) -> None:
     assert_same(read_rpc(image), better)
 
 
+@pytest.mark.parametrize(
+    ("image", "xml", "text"),
+    [
+        ("13OCT.TIF", "13OCT.XML", rpc_texts.vantor_text),
+        ("13OCT.TIF", "13OCT.XML", lambda v: rpc_texts.vantor_text(v, "urn:of:a:supplier")),
+        ("IMG_PHR1A_P_R1C1.TIF", "RPC_PHR1A_P.XML", rpc_texts.dimap_text),
+        ("IMG_PNEO3_F_1_P_R1C1.TIF", "RPC_PNEO3_F_1_P.XML", lambda v: rpc_texts.dimap_text(v, 3)),
+    ],
+)
+def test_xml_of_suppliers(tmp_path: Path, image: str, xml: str, text) -> None:
+    rpc = make_rpc(15)
+    file = write_image(tmp_path / image, None)
+    (tmp_path / xml).write_text(text(rpc.to_dict()))
+    assert_same(read_rpc(file), rpc)
+
+
+def test_xml_without_an_rpc_is_none(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "a.tif", None)
+    for text in ("<ProductMetaData/>", "<ProductMetaData>", rpc_texts.vantor_text({})):
+        (tmp_path / "a.xml").write_text(text)
+        with pytest.raises(InputError):
+            read_rpc(image)
+
+
 def test_images_without_rpc_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a.tif: .*a_RPC.TXT"):
         read_rpc(write_image(tmp_path / "a.tif", None))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stereotruth.core.errors import InputError
+from stereotruth.core.products.grids import Strip
 from stereotruth.lidar.ingest import ingest
 from stereotruth.lidar.lattice import LATTICE_DEG, Footprint
 from stereotruth.lidar.point_store import PointStore, open_stores
@@ -105,6 +106,27 @@ def test_bytes_are_the_same_for_any_groups_workers_and_order(stores, tmp_path):
     assert len(one) > 16 and all(one == other for other in others)  # with their checksums
     groups = [len(list((tmp_path / name / "s" / GROUPS).iterdir())) for name in ways]
     assert groups[0] == len(one) > groups[1] > groups[2]
+
+
+@pytest.mark.slow
+def test_strips_make_each_group_once_and_change_no_byte(stores, tmp_path, monkeypatch):
+    """There is no store before the last job, which joins what strips have made, and makes none."""
+    made, whole = [], module._Maker.make
+    monkeypatch.setattr(
+        module._Maker, "make", lambda self, *of: (made.append(of[0]), whole(self, *of))
+    )
+    for count in (1, 2, 3):
+        out, made_by = tmp_path / f"{count}" / "s", []
+        for number in reversed(range(count if count > 1 else 0)):
+            make_surface(stores, out, cell=CELL, blocks_at_once=4, strip=Strip(number, count))
+            made_by.append(sum(map(len, made)) - sum(made_by))
+            assert not out.exists()
+        before = len(made)
+        make_surface(stores, out, cell=CELL, blocks_at_once=4)
+        assert len(made) == (before if count > 1 else len(set(made))) > 3
+        assert not made_by or 2 * min(made_by) > max(made_by)  # blocks of each
+        made.clear()
+    assert len({tree_digest(tmp_path / f"{count}" / "s") for count in (1, 2, 3)}) == 1
 
 
 @pytest.mark.slow

@@ -214,12 +214,13 @@ class Dataset(Section):
     other scenes say that it is not known"""
 
     originals: Flag = False
-    """true: crops of the original images for each tile with corrected RPCs (tag and `_RPC.TXT`), in
-    `originals/<city>/`, for multi-view and neural reconstruction"""
+    """true: crops of the original images for each tile with corrected cameras (RPC, satnerf, EOGS,
+    COLMAP), in `originals/<city>/`, for multi-view and neural reconstruction"""
 
     original_heights: Flag = False
     """true: beside each crop in `originals/<city>/` the height of what each of its pixels shows,
-    with its standard uncertainty and status; of images that have a name in the images sheet"""
+    with its standard uncertainty, status and visibility in the other image; of images that have a
+    name in the images sheet"""
 
 
 class Evaluation(Section):
@@ -314,9 +315,9 @@ class Configuration(Section):
     dataset: Dataset = Field(default_factory=Dataset)
 
     strips: Annotated[Strips | dict[str, Strips], Unit("number, or scene: number")] = 1
-    """jobs among which the grid of a scene is shared, each for some rows of blocks of 1024 px; for
-    any cluster that Snakemake submits jobs to, without a Dask that runs there. The bytes are those
-    of one job"""
+    """jobs among which `rectify`, `surface` and `project` of a scene are shared, each for some
+    of its blocks; for any cluster that Snakemake submits jobs to, without a Dask that runs there.
+    The bytes are those of one job"""
 
     dask: Dask = Field(default_factory=Dask)
     report: Report = Field(default_factory=Report)

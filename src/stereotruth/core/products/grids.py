@@ -10,12 +10,13 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from traceback import format_exception
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import zarr
@@ -30,6 +31,7 @@ from .provenance import digest
 if TYPE_CHECKING:
     import xarray as xr
 
+Piece = TypeVar("Piece")
 METADATA = "zarr.json"  # of a store: all of its arrays' with its own
 SEAL = "metadata_digest"  # attribute of a store
 CONVENTIONS = (
@@ -173,7 +175,7 @@ def blocks(shape: tuple[int, int], size: int) -> list[tuple[slice, slice]]:
 
 @dataclass(frozen=True)
 class Strip:
-    """Rows of a grid that one of several jobs makes: part ``number`` (from 0 on) of ``count``."""
+    """What one of several jobs makes of a product: part ``number`` (from 0 on) of ``count``."""
 
     number: int
     count: int
@@ -196,8 +198,15 @@ class Strip:
     def of(self, windows: list[tuple[slice, slice]]) -> list[tuple[slice, slice]]:
         """The windows in the strip's rows: equal numbers of rows of windows."""
         starts = sorted({rows.start for rows, _ in windows})
-        first, end = ((self.number + k) * len(starts) // self.count for k in (0, 1))
-        return [window for window in windows if window[0].start in starts[first:end]]
+        own = self.share(starts, [1] * len(starts))
+        return [window for window in windows if window[0].start in own]
+
+    def share(self, pieces: Sequence[Piece], weights: Sequence[int]) -> list[Piece]:
+        """The strip's pieces of all, one after the other: equal sums of weights, nearly."""
+        total = max(sum(weights), 1)
+        middles = [2 * end - weight for end, weight in zip(accumulate(weights), weights)]
+        strips = (middle * self.count // (2 * total) for middle in middles)
+        return [piece for piece, strip in zip(pieces, strips) if strip == self.number]
 
     def tell(self, path: str | Path) -> None:
         """Write the file that tells that the strip is made."""

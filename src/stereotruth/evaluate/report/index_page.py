@@ -16,10 +16,8 @@ import numpy as np
 
 from ...core.errors import InputError
 from ...core.products.making import exclusive
-from ...core.products.rasters import read_image, read_tile
 from ...core.status import carries_label
 from ...pages.page import INDEX, way, write_page
-from ...pages.pictures import colours, encode, shrink, stretch
 from ...pages.tables import EMPTY, Cell, Column, Headline, Table, link_cell, spread, value_cell
 from ...tiles.manifest import SPLITS, read_manifest
 
@@ -190,6 +188,9 @@ def _city(root: Path, out: Path, page: Path, export: Mapping[str, Any]) -> tuple
 
 def _look(tiles: Path) -> tuple[str, ...]:
     """Left image and disparity of the tile of a city whose labels span most; none if damaged."""
+    from ...core.products.rasters import read_image, read_tile  # a second, where no page is
+    from ...pages.pictures import colours, encode, shrink, stretch
+
     try:
         rows = [row for row in read_manifest(tiles) if row.get("complete") == "yes"]
         row = max(rows, key=lambda r: float(r["disparity_max_px"]) - float(r["disparity_min_px"]))
