@@ -62,6 +62,8 @@ def test_the_example_is_checked_and_made(tmp_path):
     assert len(list((demo / "tiles/Demo/disp").glob("DM_*.tiff"))) >= 3
     status = call("status", folder=demo)
     assert "up to date" in status.text and "4 tiles" in status.text, status.text
+    planned = call("run", "report", "--dry-run", folder=demo)  # a page with the exact truth
+    assert re.search(r"^evaluate_truth_city +1 +\d+ +\d+ +\d+", planned.text, re.M), planned.text
 
 
 OWN_RULE = """

@@ -28,9 +28,16 @@ from stereocities import cities
 VIEWS = ("left", "right")
 
 
+def has_truth(scene):
+    """Whether the exact truth of a scene can be made: its images were simulated, here or before."""
+    of_project = cities.file_of(scene.city).is_file()
+    simulated = cities.synthetic_city(scene.city).scenes if of_project else ()
+    return is_synthetic(scene) or any(of.name == scene.scene for of in simulated)
+
+
 def synthetic_scenes(city):
-    """Names of a city's synthetic scenes, in the order of the sheet."""
-    return [s.scene for s in SCENES.values() if s.city == city and is_synthetic(s)]
+    """Names of a city's scenes with exact truth, in the order of the sheet."""
+    return [s.scene for s in SCENES.values() if s.city == city and has_truth(s)]
 
 
 try:

@@ -84,11 +84,7 @@ use rule evaluate_truth as evaluate_truth_city with:
 
 rule evaluate:
     input:
-        [
-            f"results/evaluate/{s.city}/{s.scene}/truth.json"
-            for s in SCENES.values()
-            if is_synthetic(s)
-        ],
+        [f"results/evaluate/{s.city}/{s.scene}/truth.json" for s in SCENES.values() if has_truth(s)],
         [f"results/evaluate/{city}/truth.json" for city in CITIES if synthetic_scenes(city)],
         [f"results/evaluate/{s.city}/table4.csv" for s in SCENES.values()],
     message:

@@ -48,7 +48,11 @@ rule export:
             "seed": SETTINGS.seed,
             "strict": SETTINGS.strict,
         },
-        code=source_digest("stereotruth.tiles.export", "stereotruth.align.alignment"),
+        code=source_digest(
+            "stereotruth.tiles.export",
+            "stereotruth.tiles.label_moves",
+            "stereotruth.align.alignment",
+        ),
     message:
         "Cutting the tiles of {wildcards.city}"
     script:

@@ -1,6 +1,7 @@
 rule report_city:
     input:
         tiles="tiles/{city}",
+        summary="results/export/{city}/summary.json",
         coverage="results/export/{city}/coverage.png",
         looks="results/export/{city}/quick_looks",
         alignments=of_scenes("results/align/{city}/{scene}/alignment.json"),

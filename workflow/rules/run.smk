@@ -3,6 +3,7 @@
 import shutil
 import sys
 
+from stereotruth.core.job import failures
 from stereotruth.core.products.making import FileLock, begin_notes, noted
 
 LOCKS = []  # held until this process ends
@@ -67,6 +68,4 @@ onsuccess:
 
 onerror:
     list_pages()
-    from stereotruth.project.last_lines import complaints
-
-    say(complaints(log))
+    say("\n".join(failures()))

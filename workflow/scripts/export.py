@@ -1,15 +1,18 @@
 """One city's scenes to its benchmark tiles."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 from stereotruth.align.alignment import Alignment
 from stereotruth.core.config.configuration import Export
-from stereotruth.core.products.files import atomic_file
+from stereotruth.core.products.files import atomic_file, read_json
 from stereotruth.core.products.making import rule_job
 from stereotruth.tiles.export import Extras, export_city
+from stereotruth.tiles.label_moves import edit_lines, keep_samples, since_last_run
+from stereotruth.tiles.manifest import read_manifest
 from stereotruth.tiles.scene_stores import SceneFiles
-from stereotruth.tiles.tile_checks import summary_lines
+from stereotruth.tiles.tile_checks import misfit_lines, summary_lines
 from stereotruth.tiles.tile_files import City
 
 if __name__ == "__main__":
@@ -38,8 +41,14 @@ if __name__ == "__main__":
             workers=snakemake.threads,
             work=Path(made.summary).with_name(".tiles.work"),
         )
-        summary["lines"] = summary_lines(summary, snakemake.output.tiles)
+        stores = dict(zip(snakemake.params.scenes, given.disparity))
+        moved = since_last_run(stores)
+        *lines, look = summary_lines(summary, snakemake.output.tiles)
+        lines += misfit_lines(read_manifest(snakemake.output.tiles))
+        summary["lines"] = [*lines, *edit_lines(moved, map(read_json, given.alignment)), look]
+        summary["since_last_run"] = {scene: asdict(found) for scene, found in moved.items()}
         with atomic_file(snakemake.output.summary) as scratch:
             scratch.write_text(json.dumps(summary, indent=2) + "\n")
         for line in summary["lines"]:
             log.info(line)
+        keep_samples(stores)

@@ -18,6 +18,7 @@ if __name__ == "__main__":
         scenes = by_scene(given.alignments)
         files = CityFiles(
             tiles=given.tiles,
+            summary=given.summary,
             coverage=given.coverage,
             looks={scene: Path(given.looks, f"{scene}_left.tif") for scene in scenes},
             alignments=scenes,

@@ -1,6 +1,7 @@
 """One job: its log and errors, its progress, work in a process of its own, Dask's scheduler.
 
-Terminal and log file have the same lines.
+Terminal and log file have the same lines; within ``stereotruth run`` the terminal has warnings,
+errors and the progress of long work only (NEWS_ONLY, which its logger sets).
 """
 
 from __future__ import annotations
@@ -13,15 +14,21 @@ import os
 import pickle
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from .errors import InputError, install_extra, told_by_system, without_secrets
 
 log = logging.getLogger("stereotruth")
+NEWS_ONLY = "STEREOTRUTH_NEWS_ONLY"  # environment: what the terminal shows, see above
+RUN_NOTES = Path(".snakemake", "stereotruth", "run")  # what jobs tell their run
+FAILED = RUN_NOTES / "failed"  # errors of jobs, one file for each of their logs
+NEWS_S = 20.0  # work that takes longer tells its progress
 # New objects before garbage is collected: compiling kernels makes many that stay, and walking
 # through them again and again took an eighth of its time.
 GARBAGE = 200_000
@@ -43,9 +50,13 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
     path = Path(log_file)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)  # a job of an earlier run may still write into the old one
+    with suppress(OSError):  # of an attempt before this one
+        failure_file(path).unlink()
     terminal, file = logging.StreamHandler(sys.stderr), logging.FileHandler(path, "w", "utf-8")
     terminal.setFormatter(_Discreet(f"{name}: %(message)s"))
     file.setFormatter(_Discreet(f"%(asctime)s %(levelname)s {name}: %(message)s"))
+    if os.environ.get(NEWS_ONLY):
+        terminal.addFilter(_is_news())
     handlers = (terminal, file)
     for handler in handlers:
         log.addHandler(handler)
@@ -54,14 +65,18 @@ def job(log_file: str | Path, name: str) -> Iterator[logging.Logger]:
         yield log
     except InputError as error:
         log.error("error: %s", error)
+        _note_failure(path, f"{name}: error: {error}")
         raise SystemExit(1) from None
     except (KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except BaseException as error:  # panics of libraries in Rust are no Exception
         if (told := told_by_system(error)) is None:
             log.exception("unexpected failure")
+            last = traceback.format_exception_only(error)[-1].strip()
+            _note_failure(path, f"{name}: unexpected failure: {last}. The traceback is in {path}")
             raise
         log.error("error: %s", told)
+        _note_failure(path, f"{name}: error: {told}")
         where = "".join(traceback.format_exception(error))
         file.handle(log.makeRecord(log.name, logging.INFO, "", 0, "%s", (where,), None))
         raise SystemExit(1) from None
@@ -76,6 +91,41 @@ class _Discreet(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         return without_secrets(super().format(record))
+
+
+def _is_news() -> Callable[[logging.LogRecord], bool]:
+    """A filter: warnings, errors, progress of long work; one job of a run tells of compiling."""
+
+    @cache
+    def tells_of_compiling() -> bool:
+        try:
+            (RUN_NOTES / "compiling").touch(exist_ok=False)
+        except OSError as error:  # of another kind: no run of the workflow
+            return not isinstance(error, FileExistsError)
+        return True
+
+    def chosen(record: logging.LogRecord) -> bool:
+        if record.name == "stereotruth.compiling":
+            return tells_of_compiling()
+        return record.levelno >= logging.WARNING or getattr(record, "news", False)
+
+    return chosen
+
+
+def failure_file(log_file: str | Path) -> Path:
+    """Has the error with which the job of a log has failed in this run, if it has told any."""
+    return FAILED / str(log_file).replace("/", "+")
+
+
+def _note_failure(log_file: Path, text: str) -> None:
+    with suppress(OSError):  # no run of the workflow, or a full disk
+        failure_file(log_file).write_text(without_secrets(text), encoding="utf-8")
+
+
+def failures() -> list[str]:
+    """The errors of all failed jobs of the newest run, in the order in which they ended."""
+    files = sorted(FAILED.glob("*"), key=lambda file: file.stat().st_mtime_ns)
+    return [file.read_text(encoding="utf-8") for file in files]
 
 
 def _keep_memory() -> None:
@@ -147,15 +197,35 @@ def _report(work: Callable[[], Any], sending: Any, watched: int, held: int) -> N
     sending.send(found)
 
 
+def in_time(seconds: float) -> str:
+    """A duration in words: 40 s, 12 min, 1 h 20 min."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+def _teller(total: int, what: str, unit: str = "") -> Callable[[int], None]:
+    """Logs, of so many parts done, each tenth, and how long the rest will take at this pace."""
+    began, total = time.monotonic(), max(total, 1)
+
+    def tell(done: int) -> None:
+        if done * 10 // total > (done - 1) * 10 // total:
+            passed = time.monotonic() - began
+            left = in_time(passed / done * (total - done))
+            more = f", about {left} left" if passed > NEWS_S and done < total else ""
+            text = f"{what}: {done} of {total}{unit}{more}"
+            log.info("%s", text, extra={"news": bool(more)})
+
+    return tell
+
+
 def progress(items: Iterable, total: int, what: str) -> Iterator:
     """Pass items through and log about every tenth part done."""
-    last = -1
+    tell = _teller(total, what)
     for done, item in enumerate(items, start=1):
         yield item
-        tenth = done * 10 // max(total, 1)
-        if tenth > last:
-            last = tenth
-            log.info("%s: %d of %d", what, done, total)
+        tell(done)
 
 
 def block_progress(total: int, what: str, name: str = "") -> Any:
@@ -163,15 +233,13 @@ def block_progress(total: int, what: str, name: str = "") -> Any:
     tasks count whose key begins with ``name``."""
     from dask.callbacks import Callback  # most jobs do without Dask
 
-    done = 0
+    done, tell = 0, _teller(total, what, " blocks")
 
     def count(key: object, *_: object) -> None:
         nonlocal done
-        if not str(key).startswith(name):
-            return
-        done += 1
-        if done * 10 // total > (done - 1) * 10 // total:
-            log.info("%s: %d of %d blocks", what, done, total)
+        if str(key).startswith(name):
+            done += 1
+            tell(done)
 
     return Callback(posttask=count)
 

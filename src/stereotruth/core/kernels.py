@@ -13,12 +13,14 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import logging
+import math
 import os
 import re
 import shutil
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
@@ -33,6 +35,7 @@ from numba.core.event import Event, Listener, register
 from numba.extending import register_jitable
 
 log = logging.getLogger("stereotruth.compiling")
+TELL_S = 20.0  # between lines that tell how far compiling is
 PACKAGE = Path(__file__).parent
 SHIPPED = PACKAGE / "compiled"
 """Kernels that a wheel brings along (``make wheel``)."""
@@ -179,16 +182,19 @@ class _Compilation(Listener):
     """
 
     def __init__(self) -> None:
-        self.said = False
+        self.count, self.told_at = 0, -math.inf
         self.thread = threading.local()
 
     def on_start(self, event: Event) -> None:
         """Numba asks for its lock, within which it loads, compiles and keeps; or it compiles."""
         if event.kind == "numba:compiler_lock":
             self.thread.depth = getattr(self.thread, "depth", 0) + 1
-        elif not self.said:
-            self.said = True
-            log.info("compiling, first run only")
+            return
+        self.count += 1
+        if time.monotonic() - self.told_at > TELL_S:
+            done = f": {self.count - 1} functions so far" if self.count > 1 else ""
+            log.info("compiling, once%s", done)
+            self.told_at = time.monotonic()
 
     def on_end(self, event: Event) -> None:
         """A kernel is compiled and will be kept; or it was, with the outermost of Numba's locks.

@@ -69,20 +69,29 @@ def score_surface_model(
     epilog=examples(
         "stereotruth compare benchmark/exact/sgm --with benchmark/exact/census",
         "stereotruth compare verdict/a verdict/b --with verdict/c --with verdict/d",
+        "stereotruth compare results.before --with results",
     )
 )
 def compare(
     first: Annotated[
         list[Path],
         typer.Argument(
-            help="Scores of a method or of a surface model; of several runs, a folder each."
+            help="Scores of a method or of a surface model, of several runs a folder each; or a "
+            "folder `results`."
         ),
     ],
     second: Annotated[
         list[Path], typer.Option("--with", help="Those of another; may be given again.")
     ],
 ) -> None:
-    """Say on the same tiles whether the second is better or worse than the first, or level."""
+    """Say on the same tiles whether the second is better or worse than the first, or level; of two
+    folders `results`, how far labels have moved from the first to the second."""
+    if any(second[0].glob("project/*/*.zarr")):
+        from .findings import wide
+        from .status import compare_labels
+
+        wide().print(compare_labels(first[0], second[0]))
+        return
     from stereobench.scores.paired import compare_folders
 
     for line in compare_folders(first, second):

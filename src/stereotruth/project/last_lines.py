@@ -8,9 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-REFUSED = re.compile(r"ERROR (.*?: error: .*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)")
-DEFECT = re.compile(r"ERROR (.*?: unexpected failure)\n((?:(?!\d{4}-\d\d-\d\d ).*\n?)*)")
-
 
 def last_lines(products: Iterable[str]) -> list[str]:
     """What to say of products, in the order of the workflow; without figures only where they are.
@@ -135,17 +132,3 @@ SAYINGS: dict[str, Callable[..., Iterator[str]]] = {
     r"results/predict/.*_dsm\.tif": _look,
     r"score_dsm/[^/]+/([^/]+)/([^/]+)": _surface_model,
 }
-
-
-def complaints(snakemake_logs: Iterable[str]) -> str:
-    """The errors that the failed jobs of a run have logged; of a defect its last line."""
-    text = "".join(Path(file).read_text("utf-8", "replace") for file in snakemake_logs)
-    logs = re.findall(r"^\s+log: (\S+) \(check log", text, flags=re.MULTILINE)
-    found = []
-    for file in filter(Path.is_file, map(Path, dict.fromkeys(logs))):
-        said = file.read_text("utf-8", "replace")
-        found += [message.rstrip() for message in REFUSED.findall(said)]
-        for what, trace in DEFECT.findall(said):
-            lines = trace.strip().splitlines()
-            found.append(f"{what}: {lines[-1] if lines else ''}. The traceback is in {file}")
-    return "\n".join(found)

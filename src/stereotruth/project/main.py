@@ -6,6 +6,7 @@ import io
 import logging
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -46,6 +47,22 @@ AllowedHosts = Annotated[
     list[str] | None,
     typer.Option(help="Another host of which the catalogue may name tiles; may be given again."),
 ]
+
+
+def complete(context: typer.Context) -> list[str]:
+    """For the shell: targets, profiles or cities, as the command wants; none without a project."""
+    from .run_workflow import completions
+
+    of_profile = context.info_name == "profile"
+    with suppress(InputError, OSError):
+        found = completions(["--profile"] if of_profile else context.params.get("given") or [])
+        if of_profile or context.info_name == "run":
+            return found
+        return [word.removeprefix("tiles/") for word in found if word.startswith("tiles/")]
+    return []
+
+
+named = partial(typer.Argument, autocompletion=complete)
 
 
 def _print(lines: Iterable[str]) -> None:
@@ -293,7 +310,7 @@ def lidar_tiles(
 )
 def check(
     scenes: Annotated[
-        list[str] | None, typer.Argument(help="Scenes or cities; all if none is named.")
+        list[str] | None, named(help="Scenes or cities; all if none is named.")
     ] = None,
     configfile: Configured = None,
 ) -> None:
@@ -313,7 +330,7 @@ def check(
     )
 )
 def pairs(
-    city: Annotated[str, typer.Argument(help="City of the images sheet.")],
+    city: Annotated[str, named(help="City of the images sheet.")],
     most: Annotated[int | None, typer.Option(min=1, help="Write the best so many.")] = None,
     convergence: Annotated[
         tuple[float, float], typer.Option(help="Write pairs from … to degrees of convergence.")
@@ -322,7 +339,7 @@ def pairs(
         tuple[float, float] | None, typer.Option(help="Write pairs from … to days apart.")
     ] = None,
     diachronic: Annotated[
-        bool, typer.Option("--diachronic", help="Write pairs more than 30 days apart.")
+        bool, typer.Option("--diachronic", help="Write pairs of two lights.")
     ] = False,
     each: Annotated[
         int | None, typer.Option(min=1, help="Write at most so many pairs of each image.")
@@ -351,7 +368,7 @@ def pairs(
 
 @app.command(
     context_settings=PASSED_ON,
-    options_metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]",
+    options_metavar="",
     help="Run the workflow in this folder, with its config.yaml; without a target it makes the "
     "tiles of all cities. [cyan]stereotruth targets[/cyan] lists what can be made. Any option goes "
     "to Snakemake as it is; where none says how many cores, it takes all. "
@@ -363,14 +380,19 @@ def pairs(
         "stereotruth run benchmark/synthetic/sgm -- --keep-going",
     ),
 )
-def run(context: typer.Context) -> None:
+def run(
+    context: typer.Context,
+    given: Annotated[
+        list[str] | None, named(hidden=True, metavar="[TARGET …] [OPTIONS OF SNAKEMAKE]")
+    ] = None,
+) -> None:
     """Run the workflow; see ``help`` above."""
     from .run_workflow import run_workflow
 
-    if context.args in (["--help"], ["-h"]):
+    if given in (["--help"], ["-h"]):
         typer.echo(context.get_help())
         raise typer.Exit
-    run_workflow(context.args)
+    run_workflow(given or [])
 
 
 @app.command(epilog=examples("stereotruth targets", "stereotruth run report"))
@@ -389,7 +411,7 @@ def targets(configfile: Configured = None) -> None:
     )
 )
 def profile(
-    name: Annotated[str, typer.Argument(help="The profile; without one, list them.")] = "",
+    name: Annotated[str, named(help="The profile; without one, list them.")] = "",
     folder: Annotated[
         Path | None, typer.Argument(help="Folder to be written; else the profile's name.")
     ] = None,
@@ -402,7 +424,7 @@ def profile(
 
 @app.command(epilog=examples("stereotruth status", "stereotruth status Marseille"))
 def status(
-    cities: Annotated[list[str] | None, typer.Argument(help="All if none is named.")] = None,
+    cities: Annotated[list[str] | None, named(help="All if none is named.")] = None,
     configfile: Configured = None,
 ) -> None:
     """Say what is made of each city, and what is out of date and why."""

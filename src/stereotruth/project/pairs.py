@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
@@ -18,7 +17,6 @@ from ..core.errors import InputError
 from ..lidar.point_statistics import roughness_m
 from ..lidar.point_store import PointStore
 from ..sensor.site_pairs import (
-    DIACHRONIC_DAYS,
     USUAL_ROUGHNESS_M,
     Links,
     Names,
@@ -50,7 +48,7 @@ class Choice:
     """Which pairs are written: ``most`` of those within limits.
 
     ``convergence`` (degrees) and ``days``: least and greatest, None: any; pairs without dates have
-    any number of days if no ``days`` are given. ``diachronic``: pairs of more than DIACHRONIC_DAYS.
+    any number of days if no ``days`` are given. ``diachronic``: pairs that days or suns tell to be.
     ``each``: pairs that one image may be in.
     """
 
@@ -65,12 +63,12 @@ class Choice:
         low, high = self.convergence or (0.0, 180.0)
         if not low <= pair.convergence <= high or pair.shared < LEAST_SHARED:
             return False
-        if self.days is None and not self.diachronic:
-            return True
-        if pair.days is None:
+        if self.diachronic and not pair.is_diachronic:
             return False
-        first, last = self.days or (0.0, math.inf)
-        return first <= pair.days <= last and (not self.diachronic or pair.days > DIACHRONIC_DAYS)
+        if self.days is None:
+            return True
+        first, last = self.days
+        return pair.days is not None and first <= pair.days <= last
 
     def of(self, pairs: Sequence[RatedPair]) -> list[RatedPair]:
         """The chosen of pairs that are listed best first, in that order.

@@ -57,28 +57,48 @@ WITHOUT_SCENES = re.compile(
 
 EXAMPLE = "--example"  # the synthetic cities that come with the package
 CONFIG_OPTIONS = ("--configfile", "--configfiles")
+OWN_WORDS = re.compile(r"--(logger|verbose)(=|$)")  # who asks for Snakemake's own gets them
 CORES = re.compile(r"--(cores|jobs|profile|executor)(=|$)|-[cj]")
 
 
-def list_targets(configfiles: Sequence[Path] | None = None) -> list[str]:
-    """A line for each target, and the cities, scenes, datasets and methods to put into them."""
+def _names(configfiles: Sequence[Path] | None = None) -> dict[str, list[str]]:
+    """What may stand in the place of a name of TARGETS, those of scenes with their cities."""
     settings, _ = configured(configfiles)
     cities, scenes = read_scenes(settings)
     if not names_scenes(configfiles):  # the built-in cities are made with --example alone
         cities, scenes = {}, {}
-    with_scenes = [city for city in cities if any(s.city == city for s in scenes.values())]
-    width = max(map(len, TARGETS))
-    known = {
-        "<City>": with_scenes,
+    of_cities = {scene.city for scene in scenes.values()}
+    return {
+        "<City>/<scene>": [f"{scene.city}/{name}" for name, scene in scenes.items()],
+        "<City>": [city for city in cities if city in of_cities],
         "<scene>": list(scenes),
         "<dataset>": [name for name, entry in settings.benchmark.datasets.items() if entry],
         "<method>": [name for name, entry in settings.benchmark.methods.items() if entry],
     }
+
+
+def list_targets(configfiles: Sequence[Path] | None = None) -> list[str]:
+    """A line for each target, and the cities, scenes, datasets and methods to put into them."""
+    width = max(map(len, TARGETS))
     return [f"{name:{width}}  {meaning}" for name, meaning in TARGETS.items()] + [
         f"{name}: {', '.join(values[:12])}{' …' if len(values) > 12 else ''}"
-        for name, values in known.items()
-        if values
+        for name, values in _names(configfiles).items()
+        if values and "/" not in name
     ]
+
+
+def completions(given: Sequence[str]) -> list[str]:
+    """What may stand after these arguments of a run: targets, or a profile of the package."""
+    if given[-1:] in (["--profile"], ["--workflow-profile"]):
+        return sorted(file.parent.name for file in (FILES / "profiles").glob("*/config.yaml"))
+    targets = [*TARGETS, "results/report/<City>/index.html"]
+    for name, values in _names(config_files(given)).items():
+        targets = [
+            target.replace(name, value)
+            for target in targets
+            for value in (values if name in target else [""])
+        ]
+    return targets
 
 
 def rules() -> list[str]:
@@ -209,4 +229,5 @@ def run_workflow(given: Sequence[str]) -> None:
         by_option = any(word.startswith("scenes=") for word in given)  # of --config
         if not by_option and need_scenes(given, files):
             require_scenes(files)
-    os.execv(sys.executable, [sys.executable, "-m", "snakemake", *arguments])
+    news = [] if any(map(OWN_WORDS.match, given)) else ["--logger", "stereotruth"]
+    os.execv(sys.executable, [sys.executable, "-m", "snakemake", *news, *arguments])

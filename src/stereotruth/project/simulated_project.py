@@ -66,8 +66,10 @@ DENSITIES = 0.04, 100.0  # points per m², what simulate.lidar_spacing_m can be
 
 
 def make_example(folder: Path) -> str:
-    """The pair: images, LiDAR and control points below ``folder``, its rows and settings."""
+    """The pair: images, LiDAR and control points below ``folder``, its rows and settings; and the
+    city's file, of which `evaluate` makes the exact truth."""
     (scene,) = DEMO.scenes
+    write_city(DEMO, folder / file_of(DEMO.name))
     data, points = folder / "data" / scene.name, folder / "gcps" / f"{scene.name}.csv"
     simulate_points(
         DEMO, scene, points, data / "gcps_exact.csv", data / "checkpoints.csv", seed=SEED

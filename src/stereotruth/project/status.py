@@ -1,4 +1,7 @@
-"""What is made of each city, and what a run would make and why: asked of Snakemake's own plan."""
+"""What is made of each city, and what a run would make and why: asked of Snakemake's own plan.
+
+And how two folders of results differ.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,15 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.markup import escape
+from rich.table import Table
 
 from ..core.errors import InputError
+from ..core.products.files import read_json
 from ..evaluate.report.index_page import PAGES
+from ..tiles.label_moves import moves, sample_labels, worst_point
 from ..tiles.manifest import read_manifest
 from .findings import plain_table, wide
 from .project import configured, read_scenes, require_scenes, sheet
@@ -23,6 +30,13 @@ from .run_workflow import arguments_for
 
 FOLLOWS = "Input files updated by another job"  # of a job that runs because another does
 LONGEST = 300  # characters of a reason
+MISSING = "Missing output files"  # of what was never made
+# Rules of figures and pages, which tiles are up to date without.
+AFTER_TILES = {
+    "draw_residuals", "draw_refinement", "evaluate_images", "evaluate_truth",
+    "evaluate_truth_city", "grid_truth", "report_city", "simulate_truth",
+}  # fmt: skip
+TO_DO = "a run of tiles, evaluate and report would do, and why"
 # How Snakemake says that params differ, and what stands in these; ``code``, and what stands in
 # ``sources``, are digests (workflow/rules/sources.smk).
 PARAMS = re.compile(r"Params have changed .*?before: (.*) now: (.*)")
@@ -95,7 +109,7 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
 
 @dataclass(frozen=True)
 class CityStatus:
-    """A city's tiles and pages, and what a run of its tiles would do."""
+    """A city's tiles and pages, and what a run of tiles, `evaluate` and `report` would do."""
 
     city: str
     made: str
@@ -104,8 +118,8 @@ class CityStatus:
 
     @property
     def state(self) -> str:
-        """In a few words."""
-        if not self.jobs:
+        """Of the tiles, in a few words."""
+        if all(job.rule in AFTER_TILES for job in self.jobs):
             return "up to date"
         return "out of date" if self.made else "not made"
 
@@ -113,12 +127,14 @@ class CityStatus:
         """What a run would do, and the causes of it, the most frequent first."""
         if not self.jobs:
             return []
-        rules = Counter(job.rule for job in self.jobs)
+        jobs = sorted(self.jobs, key=lambda job: job.rule in AFTER_TILES)
+        rules = Counter(job.rule for job in jobs)
         lines = [", ".join(f"{rule} {count}" for rule, count in rules.items())]
         causes: dict[str, list[str]] = {}
-        for job in self.jobs:
+        for job in jobs:
             for cause in job.causes:
-                if self.made or not cause.startswith("Missing output files"):
+                expected = not self.made or job.rule in AFTER_TILES
+                if not (expected and cause.startswith(MISSING)):
                     causes.setdefault(_short(cause), []).append(f"{job.rule} {job.of}".strip())
         for cause, of in causes.items():
             more = f" and {len(of) - 2} more" if len(of) > 2 else ""
@@ -190,7 +206,9 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
             file=sheet(settings, "scenes"),
             remedy="stereotruth scene add DELIVERY --lidar FOLDER",
         )
-    jobs = plan([f"tiles/{city}" for city in wanted], configfiles)
+    of_city = "tiles/{0}", "results/report/{0}/index.html"
+    targets = [target.format(city) for city in wanted for target in of_city]
+    jobs = plan([*targets, "evaluate"], configfiles)
     pages = [page for pattern in PAGES for page in Path().glob(pattern)]
     return [
         CityStatus(
@@ -206,10 +224,44 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
 def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> None:
     """Print a table of the cities."""
     every = status_of(cities, configfiles)
-    table = plain_table(("city", "tiles", "made", "page", "a run would do, and why"))
+    table = plain_table(("city", "tiles", "made", "page", TO_DO))
     for city in every:
         style = "green" if city.state == "up to date" else "yellow"
         page = ", ".join(city.pages) or "none"
         row = (city.city, f"[{style}]{city.state}[/{style}]", city.made or "none", page)
         table.add_row(*row, "\n".join(map(escape, city.why())))
     wide().print(table)
+
+
+def compare_labels(old: Path, new: Path) -> Table:
+    """A table of the scenes of two folders `results`: how far labels have moved from the ``old`` to
+    the ``new``, and the control points of both. Raises InputError if they share no scene."""
+    headings = ("scene", "labels, px of disparity", "control points, px rms", "worst")
+    table = plain_table(headings, whole=("scene",))
+    for store in sorted(new.glob("project/*/*.zarr")):
+        if (before := old / store.relative_to(new)).is_dir():
+            found = moves(sample_labels(before), store)
+            name = f"{store.parent.name}/{store.stem}"
+            records = [_alignment(results, name) for results in (old, new)]
+            rms = " -> ".join(map(_rms, records))
+            cells = name, str(found or "none before"), rms, worst_point(records[1])[1]
+            table.add_row(*map(escape, cells))
+    if not table.row_count:
+        raise InputError(
+            f"no labels (project/<City>/<scene>.zarr) of a scene that {old} has, too",
+            file=new,
+            remedy="name the folders `results` of two runs",
+        )
+    return table
+
+
+def _alignment(results: Path, scene: str) -> Mapping[str, Any]:
+    """The last record of a scene's alignment; empty without any."""
+    files = (results / stage / scene / "alignment.json" for stage in ("adjust", "refine", "align"))
+    return next((read_json(file) for file in files if file.is_file()), {})
+
+
+def _rms(record: Mapping[str, Any]) -> str:
+    """Of the control points' residuals, left and right image."""
+    views = (record.get(view, {}).get("rms", {}).get("after") for view in ("left", "right"))
+    return ", ".join("–" if value is None else f"{value:.3f}" for value in views)

@@ -106,6 +106,12 @@ class SitePair:
         """Height that moves a point by one of the larger pixels."""
         return self.pixel_m / max(self.base, 1e-9)
 
+    @property
+    def is_diachronic(self) -> bool:
+        """Whether days or suns tell of two lights, as :func:`pair_light` has it of labels."""
+        moved_px = 0.0 if self.shadow is None else self.shadow * BUILDING_M / self.pixel_m
+        return (self.days or 0.0) > DIACHRONIC_DAYS or moved_px > SHADOW_PX
+
 
 def angles_of(rays: tuple[Floats, Floats]) -> tuple[float, float, float]:
     """Convergence, elevation of the bisector, asymmetry of two unit vectors upwards, degrees."""

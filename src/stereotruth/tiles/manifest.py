@@ -116,6 +116,13 @@ class Tile:
         return rows, slice(self.col0, self.col0 + self.size)
 
 
+def tells_of_change(row: Mapping[str, str]) -> bool:
+    """Whether dates or suns of a tile's row tell that the ground can have changed: points of
+    another day than an image, or images of two lights. Else what is `changed` misfits."""
+    days = (row.get(f"lidar_days_{view}") for view in ("left", "right"))
+    return row.get("diachronic") == "yes" or any(cell and int(cell) for cell in days)
+
+
 def manifest_rows(file: Path) -> Iterator[dict[str, str]]:
     """Lines of a manifest, checked. Raises FileNotFoundError if there is none.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,11 @@ from ..epipolar import warping
 from ..epipolar.warping import CorrelationSum
 from .label_doubts import SceneMatches, agreement, flag, missed
 from .label_surfaces import LabelSurface
+from .manifest import tells_of_change
 from .sift_matches import FIGURES, SIFT_NOISE_PX, TileMatches
 
 ALONE = (*HIDDEN, Status.OUT_OF_FRAME.label)  # pixels that one image has alone
+MISFIT_SHARE = 0.05  # of the pixels that do not fit their images: more is told
 SIGMA_COLUMNS = ("uncertainty_median_px", "uncertainty_p95_px")
 CHECK_COLUMNS = (*FIGURES, "warp_correlation", *SIGMA_COLUMNS)
 SIGMA_ENDS_PX = np.geomspace(1e-3, 10.0, 257)  # of the bins in which uncertainties are counted
@@ -286,6 +288,21 @@ def summary_lines(summary: Mapping[str, Any], out_dir: str | Path) -> list[str]:
         for doubt in found
     ]
     return [*lines, f"Look at {out_dir}/manifest.csv, {out_dir}/left, right, disp, status"]
+
+
+def misfit_lines(rows: Iterable[Mapping[str, str]]) -> list[str]:
+    """That pixels do not fit the images, of rows of a manifest whose ground cannot have changed."""
+    labelled = [row for row in rows if row["complete"] == "yes"]
+    column = f"count_{Status.CHANGED.label}"
+    misfits = sum(int(row.get(column) or 0) for row in labelled if not tells_of_change(row))
+    share = misfits / max(sum(int(row["size"]) ** 2 for row in labelled), 1)
+    if share < MISFIT_SHARE:
+        return []
+    return [
+        f"{100 * share:.1f} % of the pixels do not fit the images or are water (status "
+        f"{Status.CHANGED.label}), and no date or sun tells of a change: look at the points, their "
+        "date and the alignment"
+    ]
 
 
 def label_uncertainty(summary: Mapping[str, Any]) -> list[str]:

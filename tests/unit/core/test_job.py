@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.job import in_own_process, job
+from stereotruth.core.job import failures, in_own_process, job, progress
+from stereotruth.core.products.making import begin_notes
 
 
 def test_input_errors_are_one_line_in_any_alphabet(tmp_path, monkeypatch) -> None:
@@ -86,3 +87,28 @@ def test_that_process_ends_with_its_parent(tmp_path) -> None:
             return
         time.sleep(0.05)
     pytest.fail("it is still there")
+
+
+def test_the_errors_of_failed_jobs_are_kept_whole_until_they_succeed(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    begin_notes()
+    with pytest.raises(SystemExit), job("logs/match.log", "match a"):
+        raise InputError("ended with status 3:\nno weights", remedy="mend it")
+    with pytest.raises(NameError), job("logs/export.log", "export a"):
+        raise NameError("name x is not defined")
+    assert failures() == [
+        "match a: error: ended with status 3:\nno weights. Remedy: mend it",
+        "export a: unexpected failure: NameError: name x is not defined. The traceback is in "
+        "logs/export.log",
+    ]
+    with job("logs/match.log", "match a"):
+        pass
+    assert len(failures()) == 1
+
+
+def test_long_work_says_how_long_it_will_take(tmp_path, monkeypatch, caplog) -> None:
+    monkeypatch.setattr("stereotruth.core.job.NEWS_S", -1.0)
+    caplog.set_level("INFO", "stereotruth")
+    assert list(progress(range(10), 10, "tiles")) == list(range(10))
+    assert [record.news for record in caplog.records] == [True] * 9 + [False]
+    assert "5 of 10, about" in caplog.messages[4]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stereotruth.evaluate.labels_against_truth import Comparison, SceneComparison
-from stereotruth.project.last_lines import complaints, last_lines
+from stereotruth.project.last_lines import last_lines
 
 SCORES = {
     "label": "SGM",
@@ -112,28 +112,3 @@ def test_figures_that_cannot_be_read_end_no_run():
         Path("results/export/A/summary.json").write_bytes(text)
         (line,) = last_lines(["tiles/A"])
         assert line.startswith("Look at tiles/A: its figures cannot be read")
-
-
-def test_the_errors_of_failed_jobs_are_said_whole():
-    Path("logs").mkdir()
-    begin = "2026-01-02 03:04:05,678 "
-    Path("logs/match.log").write_text(
-        f"{begin}INFO match a: pairs matched: 1 of 2\n"
-        f"{begin}ERROR match a: error: the program ended with status 3; its output ends with:\n"
-        "no weights\nIt was called by: ./a. Remedy: mend it\n"
-        f"{begin}INFO match a: Traceback\n"
-    )
-    Path("logs/export.log").write_text(
-        f"{begin}ERROR export a: unexpected failure\nTraceback (most recent call last):\n"
-        '  File "a.py", line 1, in <module>\nNameError: name x is not defined\n'
-    )
-    snakemake = Path("snakemake.log")
-    logs = ("match", "export", "absent")
-    snakemake.write_text("".join(f"    log: logs/{n}.log (check log file(s))\n" for n in logs))
-    assert complaints([str(snakemake)]).splitlines() == [
-        "match a: error: the program ended with status 3; its output ends with:",
-        "no weights",
-        "It was called by: ./a. Remedy: mend it",
-        "export a: unexpected failure: NameError: name x is not defined. The traceback is in "
-        "logs/export.log",
-    ]

@@ -113,8 +113,10 @@ def test_limits():
         (Choice(days=(0, 2)), {}, False),
         (Choice(days=(0, 30)), {"days": None}, False),
         (Choice(), {"days": None}, True),
-        (Choice(diachronic=True), {}, False),
-        (Choice(diachronic=True), {"days": 31.0}, True),
+        (Choice(diachronic=True), {}, True),  # shadows of buildings move by 2 px
+        (Choice(diachronic=True), {"shadow": 0.02}, False),
+        (Choice(diachronic=True), {"shadow": None}, False),
+        (Choice(diachronic=True), {"shadow": 0.02, "days": 31.0}, True),
     ):
         assert choice.allows(replace(PAIR, **change)) is taken
 

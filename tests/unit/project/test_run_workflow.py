@@ -9,11 +9,13 @@ import pytest
 
 from stereotruth.core.errors import InputError
 from stereotruth.project.check import check_project
+from stereotruth.project.main import app
 from stereotruth.project.new_project import copy_profile
 from stereotruth.project.project import FILES, configured
 from stereotruth.project.run_workflow import (
     TARGETS,
     arguments_for,
+    completions,
     config_files,
     list_targets,
     need_scenes,
@@ -38,6 +40,24 @@ def test_targets_are_listed_with_the_names_of_the_project(folder):
     lines = list_targets()
     assert [line.split()[0] for line in lines[: len(TARGETS)]] == list(TARGETS)
     assert "<City>: Good" in lines and "<scene>: Good-1" in lines
+
+
+def test_words_of_a_run_are_completed(folder, monkeypatch, capsys):
+    """As bash asks for them."""
+    assert {"slurm", "s3"} <= set(completions(["tiles/Good", "--profile"]))
+    assert "results/project/Good/Good-1.zarr" in completions([])
+
+    def asked(line: str) -> list[str]:
+        monkeypatch.setenv("_STEREOTRUTH_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", line)
+        monkeypatch.setenv("COMP_CWORD", str(line.count(" ")))
+        with pytest.raises(SystemExit):
+            app(prog_name="stereotruth")
+        return capsys.readouterr().out.split()
+
+    assert asked("stereotruth run report tiles/") == ["tiles/Good"]
+    assert asked("stereotruth status G") == ["Good"]
+    assert asked("stereotruth profile sl") == ["slurm"]
 
 
 def test_each_target_is_what_a_rule_makes():

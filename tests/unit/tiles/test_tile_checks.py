@@ -11,7 +11,8 @@ import pytest
 from stereotruth.core.config.configuration import Limits
 from stereotruth.core.errors import InputError
 from stereotruth.tiles import label_doubts
-from stereotruth.tiles.tile_checks import summary_lines
+from stereotruth.tiles.manifest import tells_of_change
+from stereotruth.tiles.tile_checks import misfit_lines, summary_lines
 from stereotruth.tiles.verify import defects
 
 from ...synthetic.tiled_scene import (
@@ -134,3 +135,16 @@ def test_a_strict_run_ends_with_scene_tile_gate_value_and_limit(made, tmp_path):
     with pytest.raises(InputError, match=r"gcp_rms_px 0\.4 is above max_gcp_rms_px 0\.1"):
         run([made["clean"].scene], tmp_path / "T", size=SIZE, quality=strict, strict=True)
     assert not (tmp_path / "T").exists()
+
+
+def test_what_cannot_have_changed_does_not_fit_the_images():
+    row = {"tile": "A_0", "complete": "yes", "size": "10", "count_changed": "9"}
+    same_days = {"lidar_days_left": "0", "lidar_days_right": "0", "diachronic": "no"}
+    for more in ({}, same_days):
+        assert not tells_of_change(row | more)
+        (line,) = misfit_lines([row | more])
+        assert "9.0 %" in line
+    for more in ({"lidar_days_right": "-3"}, {"diachronic": "yes"}):
+        assert tells_of_change(row | more) and misfit_lines([row | more]) == []
+    assert misfit_lines([row | {"count_changed": "3"}]) == []
+    assert misfit_lines([row | {"complete": "no"}]) == []

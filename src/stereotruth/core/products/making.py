@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..job import job
+from ..job import FAILED, RUN_NOTES, job
 from . import remote_files
 from .files import files_below
 from .provenance import digest, file_sha256
@@ -36,7 +36,7 @@ Marks = Mapping[str, tuple[int, ...]]
 
 log = logging.getLogger("stereotruth")
 
-MADE = Path(".snakemake", "stereotruth", "made")  # what the jobs of a run have made
+MADE = RUN_NOTES / "made"  # what the jobs of a run have made
 _inputs: Marks = {}  # of this process's job
 
 
@@ -258,9 +258,10 @@ def rule_job(snakemake: Any, name: str) -> Iterator[logging.Logger]:
 
 
 def begin_notes() -> None:
-    """Have the jobs of a run that begins note what they make."""
-    shutil.rmtree(MADE, ignore_errors=True)
-    MADE.mkdir(parents=True, exist_ok=True)
+    """Have the jobs of a run that begins note what they make, and why they fail."""
+    shutil.rmtree(RUN_NOTES, ignore_errors=True)
+    for folder in (MADE, FAILED):
+        folder.mkdir(parents=True, exist_ok=True)
 
 
 def noted() -> list[str]:

@@ -20,10 +20,11 @@ import numpy as np
 from ...core.errors import InputError
 from ...core.job import progress
 from ...core.products.files import read_table
+from ...core.status import Status
 from ...pages.page import way, write_page
 from ...pages.pictures import DISPARITIES, Scale, encode_file
 from ...pages.tables import minus, missed, table
-from ...tiles.manifest import NONE, SPLITS, read_manifest
+from ...tiles.manifest import NONE, SPLITS, read_manifest, tells_of_change
 from ...tiles.orientation import PixelSize
 from ...tiles.quick_looks import SPLIT_COLOURS, status_colours
 from .city_pictures import (
@@ -55,6 +56,7 @@ MOST_BYTES = {"figures": 600_000, "thumbnails": 24_000, "sliders": 200_000}  # o
 COVERAGE_PX, FIGURE_PX, THUMBNAIL_PX, SLIDER_PX = 2200, 1400, 320, 900
 KINDS = ("left", "right", "disparity", "status")
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
+CHANGED, MISFIT = Status.CHANGED.label, "does_not_fit_the_images"
 FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest
 FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and these come first
 
@@ -63,14 +65,16 @@ FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and 
 class CityFiles:
     """Files of a city; a section of the page is left out whose file is None or missing.
 
-    ``tiles``: the exported tiles; ``coverage``: the coverage map (PNG); ``looks``: georeferenced
-    pictures of the left images by scene; ``alignments``, ``refinements``: alignment.json by scene,
+    ``tiles``: the exported tiles; ``summary``: what the last lines of a run say of them;
+    ``coverage``: the coverage map (PNG); ``looks``: georeferenced pictures of the left images by
+    scene; ``alignments``, ``refinements``: alignment.json by scene,
     after the fit to the GCPs and after refinement, with their figures (PNG) ``residual_figures``
     and ``refinement_figures``; ``truth``, ``truth_table``: truth.json and truth.csv; ``table4``,
     ``sift``: table4.csv and sift.csv with their ``sift_figure`` (PNG).
     """
 
     tiles: Place
+    summary: Place | None = None
     coverage: Place | None = None
     looks: Mapping[str, Place] = field(default_factory=dict)
     alignments: Mapping[str, Place] = field(default_factory=dict)
@@ -128,6 +132,7 @@ def write_report(
     )
     sizes = _pixel_sizes(folder, labelled)
     height = max((size.height_m for size in sizes.values()), default=None)
+    since = {"since_last_run": _record(files.summary).get("since_last_run", {})}
     truth_rows = _rows(files.truth_table)
     figure_count = 2 + len(files.looks) + 2 * len(alignments)
     allowed = _allowance("figures", figure_count)
@@ -147,7 +152,7 @@ def write_report(
     values = {
         "city": city,
         "index": way(out, index),
-        "headlines": headlines(rows, alignments, refined, truth_rows, export, height),
+        "headlines": headlines(rows, alignments, refined, truth_rows, export | since, height),
         "sizes": sizes,
         "height_m_per_px": height,
         "links": files.links(out),
@@ -232,7 +237,7 @@ def _of_tiles(
         "disparities": limits and Scale.of(DISPARITIES, *(minus(f"{v:.0f} px") for v in limits)),
         "missed": {row["tile"]: missed(row) for row in rows if missed(row)},
         "statuses": _shares(every),
-        "status_colours": status_colours(list(every)),
+        "status_colours": status_colours(list(every)) | {MISFIT: Status.CHANGED.colour},
         "shares": {tile: _shares(counts) for tile, counts in statuses.items()},
         "split_colours": SPLIT_COLOURS,
         "no_match": f"rgb{NO_MATCH}",
@@ -287,14 +292,10 @@ def _pixel_sizes(folder: Path, labelled: Sequence[Row]) -> dict[str, PixelSize]:
 
 
 def status_counts(row: Row) -> Counter[str]:
-    """Pixels of a tile by status."""
-    return Counter(
-        {
-            name.removeprefix("count_"): int(value)
-            for name, value in row.items()
-            if name.startswith("count_") and value
-        }
-    )
+    """Pixels of a tile by status; what is `changed` where nothing tells of a change, as MISFIT."""
+    told, start = tells_of_change(row), "count_"
+    counts = ((n.removeprefix(start), v) for n, v in row.items() if n.startswith(start) and v)
+    return Counter({MISFIT if n == CHANGED and not told else n: int(v) for n, v in counts})
 
 
 def _shares(counts: Counter[str]) -> dict[str, float]:

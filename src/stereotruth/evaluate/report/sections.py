@@ -29,6 +29,7 @@ from ...pages.tables import (
     words,
 )
 from ...tiles.label_doubts import ABOUT, ALIGNMENT, LIDAR
+from ...tiles.label_moves import Moves, worst_point
 from ...tiles.manifest import NONE, SPLITS
 from ...tiles.sift_matches import SIFT_NOISE_PX
 from .city_pictures import calibration
@@ -63,19 +64,21 @@ def headlines(
 ) -> list[Headline]:
     """The figures of a city; those whose input is missing are left out.
 
-    ``rows`` of the manifest, ``truth`` of truth.csv, ``export``: export.json; ``alignments``,
-    ``refined`` by scene; ``height_m_per_px``: metres of height for one px of disparity.
+    ``rows`` of the manifest, ``truth`` of truth.csv, ``export``: export.json, and what is known
+    ``since_last_run``; ``alignments``, ``refined`` by scene; ``height_m_per_px``: metres of height
+    for one px of disparity.
     """
     quality = export.get("quality", {})
     labelled = [row for row in rows if row["complete"] == "yes"]
     scenes = list(quality.get("scenes", {}).values())
     by_scope = {row["scope"]: row for row in truth}
     best = by_scope.get("tiles") or by_scope.get("scene") or {}
-    found = _uncertainty(export.get("label_uncertainty", {}), height_m_per_px)
     error = number(best.get("mean_absolute_px", ""))
+    found = _uncertainty(export.get("label_uncertainty", {}), height_m_per_px, error)
     if error is not None:
         note = joined("mean absolute", metres(error, height_m_per_px))
         found.append(Headline("error against the truth", f"{error:.3f} px", note))
+    found += _moved(export.get("since_last_run", {}))
     found.append(_pairs(rows, labelled))
     shares = [s for row in labelled if (s := number(row["labelled_share"])) is not None]
     if shares:
@@ -99,8 +102,21 @@ def headlines(
     return found
 
 
-def _uncertainty(by: Mapping[str, Any], height_m_per_px: float | None) -> list[Headline]:
-    """How well labels are known by what they state: of all, and by what they lie on."""
+def _moved(scenes: Mapping[str, Any]) -> list[Headline]:
+    """How far labels have moved since the last run, by scene; nothing after a first one."""
+    moved = {scene: Moves(**values) for scene, values in scenes.items()}
+    if not moved:
+        return []
+    text = f"{spread([of.median_px for of in moved.values()], '.3f')} px"
+    notes = [f"{scene}: {of}" if len(moved) > 1 else str(of) for scene, of in moved.items()]
+    return [Headline("moved since the last run", text, "; ".join(notes))]
+
+
+def _uncertainty(
+    by: Mapping[str, Any], height_m_per_px: float | None, error_px: float | None
+) -> list[Headline]:
+    """How well labels are known by what they state: of all, and by what they lie on; and by the
+    exact truth, mean absolute ``error_px``, where there is one."""
     if "all" not in by:
         return []
     median, most = (by["all"][f"uncertainty_{name}_px"] for name in ("median", "p95"))
@@ -110,7 +126,10 @@ def _uncertainty(by: Mapping[str, Any], height_m_per_px: float | None) -> list[H
         if name != "all"
     )
     note = joined(
-        f"median; {most:.2g} px for 95 %", metres(median, height_m_per_px), f"medians: {surfaces}"
+        f"median; {most:.2g} px for 95 %",
+        "" if error_px is None else f"by the exact truth off by {error_px:.2g} px in the mean",
+        metres(median, height_m_per_px),
+        f"medians: {surfaces}",
     )
     return [Headline("labels known to", f"{median:.2g} px", note)]
 
@@ -235,6 +254,8 @@ def _gcps(alignments: Records, refined: Records) -> Headline:
     note = f"{rms(alignments, 'before')} px before"
     if refined:
         note += f", {rms(refined, 'after')} px after refinement"
+    (_, worst), scene = max((worst_point(of), name) for name, of in (alignments | refined).items())
+    note = joined(note, worst and (f"{scene}: {worst}" if len(alignments) > 1 else worst))
     return Headline("GCP residuals, rms", f"{rms(alignments, 'after')} px", note)
 
 

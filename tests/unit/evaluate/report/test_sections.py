@@ -107,3 +107,31 @@ def test_what_alignment_and_lidar_doubt_stands_there_too():
         (gates,) = (c for c in every if c.title == "limits of quality")
         assert gates.bad != explained
         assert ("alignment or LiDAR of A-1 in doubt" in gates.note) != explained
+
+
+def test_how_far_an_edit_has_moved_labels_and_the_worst_control_point():
+    moved = {"count": 9, "median_px": 0.0213, "most_px": 0.35, "gone_share": 0.012}
+    record = {
+        view: {
+            "rms": {"before": 8.0, "after": 0.3},
+            "gcps": [{"id": id, "after": [0, 0.5], "leave_one_out": [0, out]} for id, out in gcps],
+        }
+        for view, gcps in (("left", (("a", 0.1), ("b", 0.1), ("c", 0.6))), ("right", ()))
+    }
+    found = headlines((ROW,), {"A-1": record}, {}, (), {"since_last_run": {"A-1": moved}})
+    by_title = {card.title: card for card in found}
+    card = by_title["moved since the last run"]
+    assert card.value == "0.021 px" and "0.35 px" in card.note and "1.2 %" in card.note
+    assert "c (left image): 0.50 px" in by_title["GCP residuals, rms"].note
+    assert "moved since the last run" not in cards({"A-1": SCENE})
+
+
+def test_the_first_card_has_the_exact_truth_where_there_is_one():
+    export = {
+        "label_uncertainty": {"all": {"uncertainty_median_px": 0.04, "uncertainty_p95_px": 0.1}}
+    }
+    truth = [{"scope": "tiles", "mean_absolute_px": "0.0213"}]
+    first, *_ = headlines((ROW,), {}, {}, truth, export)
+    assert first.value == "0.04 px" and "0.021 px" in first.note
+    first, *_ = headlines((ROW,), {}, {}, (), export)
+    assert "truth" not in first.note
