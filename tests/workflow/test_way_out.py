@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,7 +18,7 @@ from ..synthetic.project import SIZE, row_of
 
 CATALOGS = {"stac": "pystac", "croissant": "mlcroissant"}
 FORMS = {
-    "layouts": ["whu", "kitti", "us3d"],
+    "layouts": ["whu", "kitti", "us3d", "webdataset", *["parquet"] * bool(find_spec("pyarrow"))],
     "catalogs": [name for name, module in CATALOGS.items() if find_spec(module)],
     "originals": True,
 }
@@ -40,6 +41,9 @@ def test_the_dataset_has_the_forms_that_are_asked_for(complete):
     for layout in ("kitti", "us3d"):
         found = StereoDataset("d", complete.folder / f"dataset_{layout}", layout, RANGE)
         assert {pair.name for pair in found.pairs(labelled=True)} == names
+    for layout in set(FORMS["layouts"]) & {"webdataset", "parquet"}:
+        with (complete.folder / f"dataset_{layout}/manifest.csv").open() as table:
+            assert {row["tile"] for row in csv.DictReader(table)} == names
     crops = {p.stem for p in (complete.folder / "originals/Tiny/left").glob("*.tif")}
     assert crops >= names
     footprints = json.loads((complete.folder / "dataset/footprints.geojson").read_text())

@@ -109,6 +109,7 @@ rule dataset:
             "acquired": SETTINGS.dataset.acquired,
         },
         layouts=[name for name in SETTINGS.dataset.layouts if name != "whu"],
+        license=SETTINGS.dataset.license,
         code=source_digest("stereotruth.tiles.layouts"),
     message:
         "Putting the cities together in the layout of the published dataset"

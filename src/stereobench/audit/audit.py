@@ -32,6 +32,7 @@ from stereotruth.pages.page import way
 from stereotruth.tiles.manifest import SPLITS
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
+from .errata import write_errata
 from .matches import Features, Shared, features, find_shared
 from .page import write_audit
 from .pair import measure
@@ -49,12 +50,14 @@ def audit(
     workers: int = 1,
     code: str = "",
     index: str | Path | None = None,
+    delta: str | Path | None = None,
 ) -> dict[str, Any]:
     """Audit all pairs of a dataset into the folder ``out``; returns the summary.
 
     ``work``: what was measured of each pair stays there, with a record of the files that it was
     measured from and of the ``code``, for runs after a kill, with other limits or with more pairs;
-    ``index``: the page of all pages, for a link.
+    ``index``: the page of all pages, for a link; ``delta``: a folder for the errata of its labels
+    (:mod:`.errata`), if they are wanted.
 
     Raises InputError if the dataset has no pairs or a file cannot be read.
     """
@@ -76,6 +79,8 @@ def audit(
         (scratch / "README.txt").write_text(readme(summary), encoding="utf-8")
         page, to_index = scratch / "index.html", way(out / "index.html", index)
         write_audit(page, dataset, audited, summary, settings, index=to_index)
+    if delta is not None:
+        write_errata(delta, dataset, audited, settings)
     for line in summary["statements"]:
         log.info("%s", line)
     return summary

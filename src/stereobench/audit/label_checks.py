@@ -48,6 +48,8 @@ APART_PX = 3  # from here on it is elsewhere
 REACH_PX = 64
 MARGIN = 0.2  # of correlation, by which elsewhere must be better,
 CLEAR = 0.8  # and good
+MASK_STEP_PX = 3  # between those that are tried where labels are to be masked,
+MASK_CELLS = 5  # by the majority of so many in each direction
 DECOY_ROWS = (29, -37, 43, -51)  # in turn
 
 # Hidden pixels.
@@ -204,6 +206,19 @@ def _beats(there: Floats, here: Floats) -> Bools:
         return (there >= CLEAR) & (there - here >= MARGIN)
 
 
+def contradicted_labels(
+    left: Picture, right: Picture, labels: Labels, reach: tuple[float, float]
+) -> Bools:
+    """Labels [h, w] around which another place beats most of those tried, and no decoy does."""
+    scan = scan_labels(left, right, labels, reach, MASK_STEP_PX)
+    tried, beaten = np.zeros((2, *(-(-size // MASK_STEP_PX) for size in labels.shape)))
+    at = (scan.y / MASK_STEP_PX).astype(int), (scan.x / MASK_STEP_PX).astype(int)
+    tried[at], beaten[at] = 1.0, scan.beaten & ~scan.beaten_by_chance
+    most = cv2.blur(beaten, (MASK_CELLS,) * 2) > 0.5 * cv2.blur(tried, (MASK_CELLS,) * 2)
+    around = np.kron(most, np.ones((MASK_STEP_PX,) * 2, bool))[: labels.shape[0], : labels.shape[1]]
+    return around & np.isfinite(labels)
+
+
 def _best_peak(correlation: Floats) -> Floats:
     """The best peak of each row [n, odd] beyond APART_PX of the middle; NaN for none."""
     middle = correlation.shape[1] // 2
@@ -214,8 +229,14 @@ def _best_peak(correlation: Floats) -> Floats:
     return np.where(np.isfinite(best), best, np.nan)
 
 
-def scan_labels(left: Picture, right: Picture, labels: Labels, reach: tuple[float, float]) -> Scan:
-    """Try labels on a regular grid of a pair [h, w] whose rows correspond.
+def scan_labels(
+    left: Picture,
+    right: Picture,
+    labels: Labels,
+    reach: tuple[float, float],
+    step: int = SCAN_STEP_PX,
+) -> Scan:
+    """Try labels on a grid of ``step`` px of a pair [h, w] whose rows correspond.
 
     The pixels of the label's own surface in a window are brought to the right image by their
     labels, and by the labels plus every shift up to ``reach``, the least and largest disparity (px)
@@ -225,7 +246,7 @@ def scan_labels(left: Picture, right: Picture, labels: Labels, reach: tuple[floa
     right image that cannot hold the match. Labels whose window leaves the right image, or holds too
     few labels of one surface, are not tried.
     """
-    steps = (slice(0, size, SCAN_STEP_PX) for size in left.shape)
+    steps = (slice(0, size, step) for size in left.shape)
     y, x = (v.ravel() for v in np.mgrid[tuple(steps)])
     # a column further right is a smaller disparity
     first = np.maximum(np.ceil(labels[y, x] - reach[1]), -REACH_PX)

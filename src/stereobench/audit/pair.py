@@ -27,6 +27,7 @@ OFF_ROW_PX = 1.0  # a match that is further off the rows' trend
 GROSS_PX = 3.0  # a match that is further off the labels' bias
 POOR = 0.5  # correlation, less of which counts as such
 EXTRA_PX = 32.0  # disparities are looked for so far beyond the stated range
+LEAST_REACH_PX = 1.0  # of labels about their middle, to tell their scale
 CERTAIN = 0.01  # level at which a convention or an order in depth is taken over
 
 
@@ -102,7 +103,7 @@ def measure_arrays(
     if taken in (SIGN, SWAPPED_SIGN):
         labels, spikes = -labels, [-value for value in spikes]
     errors = label_offsets(left, right, labels, matches)
-    found["bias"], bias = _bias(errors, matches, labels.shape)
+    found["bias"], bias = _bias(errors, matches, labels)
     found["spikes"] = [
         _plain(label_checks.wrong_at(labels, value, bias, matches)) for value in spikes
     ]
@@ -165,33 +166,67 @@ def _to_rows(right: Picture, plane: tuple[float, float, float]) -> Picture:
     return np.ascontiguousarray(np.nan_to_num(moved).T, np.float32)
 
 
-def _bias(errors: Floats, matches: Matches, shape: tuple[int, ...]) -> tuple[dict[str, Any], float]:
+def scale_of_labels(values: Floats) -> tuple[float, float]:
+    """Middle of labels [n], and how far their 5 and 95 % quantiles lie from it, px."""
+    low, middle, high = np.percentile(values, (5, 50, 95))
+    return float(middle), float(high - low) / 2.0
+
+
+def _bias(errors: Floats, matches: Matches, labels: Labels) -> tuple[dict[str, Any], float]:
     """Labels less disparities, [n] for n matches (NaN where there is none)."""
     known = np.isfinite(errors)
     errors, x, y = errors[known], matches.x[known], matches.y[known]
     if not errors.size:
         return {"matches": 0, "bias": _plain(NOTHING)}, 0.0
-    trend = _trend(errors, x, y, shape)
+    trend = _trend(errors, x, y, labels.shape)
+    values = labels[y.astype(int), x.astype(int)].astype(np.float64)
+    middle, reach = scale_of_labels(values)
+    scale = Estimate(0.0, 0.0, 1)
+    if reach >= LEAST_REACH_PX:
+        design = np.column_stack([np.ones(x.size), (values - middle) / reach])
+        scale = robust_fit(design, errors, cells(x, y))[1]
     bias = trend[0].value if np.isfinite(trend[0].value) else float(np.median(errors))
     return {
         "matches": errors.size,
         **{name: _plain(of) for name, of in zip(("bias", "tilt_x", "tilt_y"), trend)},
+        "scale": _plain(scale),
         "spread": scale_of(errors),
         "gross": float(np.mean(np.abs(errors - bias) > GROSS_PX)),
     }, bias
 
 
+def wrong_labels(
+    left: NDArray[Any], right: NDArray[Any], labels: Labels, matches: Matches, front: str
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Labels [h, w] on hidden pixels, and those that the images contradict; free of a bias.
+
+    ``front``: LARGER or SMALLER disparities are in front.
+    """
+    a, b = grey(left), grey(right)
+    hidden = label_checks.hidden_labels(labels, front)
+    if (reach := _reach(labels, matches)) is None:
+        return hidden, np.zeros(labels.shape, bool)
+    b = _to_rows(b, _rows(matches, a.shape)[1])
+    return hidden, label_checks.contradicted_labels(smooth(a), smooth(b), labels, reach) & ~hidden
+
+
+def _reach(labels: Labels, matches: Matches) -> tuple[float, float] | None:
+    """Least and greatest disparity that may be right in a pair, px; None: nothing is known."""
+    known = np.concatenate([labels[np.isfinite(labels)], matches.disparity])
+    if not known.size:
+        return None
+    low, high = np.percentile(known, (0.5, 99.5))
+    return float(low) - 4.0, float(high) + 4.0
+
+
 def _contradicted(
     left: Picture, right: Picture, labels: Labels, matches: Matches
 ) -> dict[str, Any]:
-    known = np.concatenate([labels[np.isfinite(labels)], matches.disparity])
-    nothing = {"labels": 0, "share": _plain(NOTHING)}
-    if not known.size:
-        return nothing
-    low, high = np.percentile(known, (0.5, 99.5))
-    scan = label_checks.scan_labels(left, right, labels, (low - 4.0, high + 4.0))
+    if (reach := _reach(labels, matches)) is None:
+        return {"labels": 0, "share": _plain(NOTHING)}
+    scan = label_checks.scan_labels(left, right, labels, reach)
     if not scan.x.size:
-        return nothing
+        return {"labels": 0, "share": _plain(NOTHING)}
     return {
         "labels": scan.x.size,
         "share": _plain(scan.contradicted()),

@@ -43,11 +43,15 @@ CHECKS = {  # what a pair must have, in the order of the page
     "hidden": "labels on visible pixels only",
     "shared": "ground in one split only",
 }
-OFFSETS = {"parallax": ("rows", "vertical parallax"), "bias": ("bias", "label - match")}
 TO_EDGES = {
     "": "",
     "tilt_x": ", from the middle to the right edge",
     "tilt_y": ", from the middle to the lower edge",
+}
+TO_ENDS = {"scale": ", from the middle to the largest labels"}
+OFFSETS = {  # check, what it is, and where it may differ
+    "parallax": ("rows", "vertical parallax", TO_EDGES),
+    "bias": ("bias", "label - match", TO_EDGES | TO_ENDS),
 }
 
 # A dataset.
@@ -62,6 +66,7 @@ POOLED = {  # figure: where it stands, as an estimate or a number
     "label_bias_px": ("bias", "bias"),
     "label_bias_tilt_x_px": ("bias", "tilt_x"),
     "label_bias_tilt_y_px": ("bias", "tilt_y"),
+    "label_scale_px": ("bias", "scale"),
     "contradicted_share": ("contradicted", "share"),
 }
 PLAIN = {
@@ -151,11 +156,11 @@ def _offset(
     figures: Figures, name: str, tolerance: float, level: float, matches: int
 ) -> list[Finding]:
     """Whether one of OFFSETS and its tilts, told by so many matches, are tolerated."""
-    check, what = OFFSETS[name]
+    check, what, places = OFFSETS[name]
     faults, is_open = [], False
-    for tilt, where in TO_EDGES.items():
+    for tilt, where in places.items():
         value = estimate(figures, check, tilt or name)
-        says = value.beyond(tolerance, level / len(TO_EDGES))
+        says = value.beyond(tolerance, level / len(places))
         if says:
             low, high = value.interval(0.05)
             faults.append(f"{what}{where} {value.value:+.2f} px ({low:+.2f} … {high:+.2f})")

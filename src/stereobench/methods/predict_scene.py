@@ -30,6 +30,7 @@ from stereotruth.core.job import block_progress
 from stereotruth.core.products.grids import Layer, require_complete
 from stereotruth.core.products.provenance import describe, digest, file_sha256
 from stereotruth.core.products.resumable_grids import BlockStore, resumable_grid
+from stereotruth.epipolar.intersection import PLACE
 
 from .kinds import kind_of, names_of
 from .matcher import Matcher
@@ -227,6 +228,7 @@ def predict_scene(
             "scene": scene,
             "view": "left",
             "epipolar": left_attrs.get("epipolar"),
+            **{name: left_attrs[name] for name in PLACE if name in left_attrs},
             "settings": parameters,
             "block_offsets_px": moved.offsets.tolist(),
             "summary": summary,

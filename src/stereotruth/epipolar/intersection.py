@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,23 @@ SYSTEM = "EPSG:4979"  # WGS 84: longitude, latitude, ellipsoidal height
 TOLERANCE_M = 1e-5
 FRESH = 64  # px along a row after which the derivatives are taken anew
 DEG = 1.0 / DEGREE_M  # per metre, about
+GEOZARR = [  # conventions of Zarr, by which GDAL and rioxarray find system and place of a grid
+    {
+        "uuid": "f17cb550-5864-4468-aeb7-f3180cfb622f",
+        "name": "proj:",
+        "spec_url": "https://github.com/zarr-conventions/geo-proj/blob/v1/README.md",
+    },
+    {
+        "uuid": "689b58e2-cf7b-45e0-9fff-9cfc0883d6b4",
+        "name": "spatial:",
+        "spec_url": "https://github.com/zarr-conventions/spatial/blob/v1/README.md",
+    },
+]
+PLACE = (  # attributes of a grid
+    *("zarr_conventions", "proj:code", "place"),
+    *("spatial:dimensions", "spatial:transform", "spatial:bbox"),
+)
+PLACES = 9  # along each side of a grid, that its place on a map is taken from
 
 
 @inner
@@ -162,3 +179,35 @@ def with_ground(grid: xr.Dataset) -> xr.Dataset:
     found = grid.assign_coords(coordinates | {"crs": ((), 0, pyproj.CRS(SYSTEM).to_cf())})
     found["height"] = found["height"].assign_attrs(grid_mapping="crs")
     return found
+
+
+def coarse_place(model: EpipolarModel, view: str = "left") -> dict[str, Any]:
+    """Attributes of GeoZarr by which maps show the grid of a view, which lies on no map's plane.
+
+    The place is the affine function of the pixels that comes nearest to what they see at the
+    model's reference height, in degrees; ``place`` says how far off it is there and over all
+    heights of the model. Exact places are those of :func:`with_ground`.
+    """
+    rows, cols = model.shape
+    axes = np.linspace(0.0, cols - 1.0, PLACES), np.linspace(0.0, rows - 1.0, PLACES)
+    x, y = (grid.ravel() for grid in np.meshgrid(*axes))
+    seen = getattr(model, f"{view}_image").inverse(x, y)
+    heights = model.reference_height, *model.height_range
+    ground = np.stack([getattr(model, view).localize(*seen, height) for height in heights])
+    known = np.isfinite(ground).all(axis=(0, 1))
+    if known.sum() < 3:
+        return {}
+    design = np.column_stack([x + 0.5, y + 0.5, np.ones(x.size)])[known]  # from the grid's corner
+    fit = np.linalg.lstsq(design, ground[0][:, known].T)[0]
+    metres = DEGREE_M * np.array([[np.cos(np.radians(fit[2, 1]))], [1.0]])
+    off = np.linalg.norm((ground[:, :, known] - (design @ fit).T) * metres, axis=1).max(axis=1)
+    corners = np.array([[0, 0, 1], [cols, 0, 1], [0, rows, 1], [cols, rows, 1]]) @ fit
+    return {
+        "zarr_conventions": GEOZARR,
+        "proj:code": "EPSG:4326",
+        "spatial:dimensions": ["y", "x"],
+        "spatial:transform": fit.T.ravel().tolist(),
+        "spatial:bbox": [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()],
+        "place": f"coarse, to find the grid on a map: within {off[0]:.1f} m at {heights[0]:.0f} m "
+        f"above the ellipsoid, {off.max():.0f} m from {heights[1]:.0f} to {heights[2]:.0f} m",
+    }

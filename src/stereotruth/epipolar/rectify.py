@@ -26,6 +26,7 @@ from ..core.products.resumable_grids import BlockStore, resumable_grid
 from ..sensor.deliveries import read_acquisition
 from ..sensor.images import Source
 from ..sensor.rpc import SensorModel
+from .intersection import coarse_place
 from .model import COLOURS, EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, resample
 
@@ -250,6 +251,7 @@ def rectify(
             attrs = {
                 "view": view,
                 "epipolar": model.to_dict(),
+                **coarse_place(model, view),
                 "provenance": dict(provenance or {}),
             } | _of_delivery(source, getattr(model, view))
             source.check_blocks(workers)

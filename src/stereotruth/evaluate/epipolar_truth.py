@@ -25,6 +25,7 @@ from stereocities.truth import LAYERS as OF_IMAGES
 from ..core.errors import InputError
 from ..core.job import progress
 from ..core.products.grids import Layer, atomic_store, blocks, create_grid
+from ..epipolar.intersection import coarse_place
 from ..epipolar.model import EpipolarModel
 
 CHUNK = 256
@@ -139,6 +140,7 @@ def write_grid_truth(
         "kind": "truth",
         "scene": scene.name,
         "epipolar": model.to_dict(),
+        **coarse_place(model),
         "provenance": dict(provenance or {}),
     }
     with atomic_store(out_zarr) as scratch, ThreadPoolExecutor(workers) as pool:

@@ -33,6 +33,7 @@ from ..core.products.making import refuse_replaced
 from ..core.products.provenance import checksums, describe, digest
 from ..core.products.resumable_grids import Block, BlockStore, Ledger, resumable_grid
 from ..core.status import Status, carries_label, is_labelled
+from ..epipolar.intersection import coarse_place
 from ..epipolar.model import EpipolarModel
 from ..lidar.lattice import apart, refuse_apart
 from .change_evidence import Evidence
@@ -260,19 +261,20 @@ def _attributes(inputs: SceneInputs, extent: _Extent, scene: str, code: str) -> 
     made_of = {name: digest(dict(attrs.get("provenance", {}))) for name, attrs in stores.items()}
     if inputs.alignment is not None:
         made_of |= checksums([inputs.alignment])
-    parameters = _parameters(inputs)
+    parameters, model = _parameters(inputs), EpipolarModel.from_dict(epipolar)
     return {
         "kind": "disparity",
         "scene": scene,
         "view": inputs.view,
         "epipolar": epipolar,
+        **coarse_place(model, inputs.view),
         "points_bounds": [*extent.points, *extent.heights],
         "alignment_sigma_px": inputs.pair.uncertainty.sigma,
         "points_per_m2": round(inputs.points_per_m2, 4),
         "points_per_px": round(inputs.points_per_m2 * inputs.rays.pixel_m**2, 4),
         "points_bounds_order": "lon_min, lat_min, lon_max, lat_max (degrees), "
         "height_min, height_max (m, ellipsoidal)",
-        "lidar": lidar_read(inputs, EpipolarModel.from_dict(epipolar)),
+        "lidar": lidar_read(inputs, model),
         "settings": parameters,
         "light": None if inputs.light is None else asdict(inputs.light),
         "provenance": describe(made_of, parameters, code),

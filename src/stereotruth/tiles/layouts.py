@@ -1,4 +1,4 @@
-"""The dataset of all cities' tiles, in the layouts of WHU-Stereo, KITTI and US3D (DFC2019).
+"""The dataset of all cities' tiles, in the layouts of WHU-Stereo, KITTI, US3D, and in shards.
 
 WHU-Stereo's is that of the dataset itself (README). Files are copied, not linked: whoever edits the
 dataset must not change the tiles behind it. The others (OTHERS) are made of it.
@@ -11,6 +11,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -31,6 +32,7 @@ from ..core.products.rasters import (
     write_tiff,
 )
 from ..pages import pictures
+from . import packages
 from .manifest import KINDS, NO_TRUTH, NONE, PATHS, SPLITS, SUM, TRUTH, column, read_manifest
 from .quick_looks import read_footprints, write_footprints
 from .splits import shared_ground
@@ -223,34 +225,53 @@ class _Pair:
     layers: Mapping[str, NDArray[Any]]  # agl, class: of those that the dataset has
 
 
-def write_layout(dataset: str | Path, out: str | Path, layout: str) -> int:
+def write_layout(
+    dataset: str | Path, out: str | Path, layout: str, *, license_name: str = "other"
+) -> int:
     """Write the labelled pairs of ``dataset`` (rule dataset's) to ``out``; how many there are.
+
+    ``license_name``: of the card of webdataset and parquet.
 
     Raises InputError if the dataset has no manifest or an image cannot be written so.
     """
-    dataset, write = Path(dataset), {"kitti": _kitti, "us3d": _us3d}[layout]
+    dataset = Path(dataset)
     rows = [row for row in read_manifest(dataset) if row["disp"]]
     with atomic_folder(out) as scratch:
-        table = []
-        for row in progress(rows, len(rows), f"dataset as {layout}: pairs"):
-            images = (read_image(dataset / row[view]) for view in ("left", "right"))
-            disparity = read_disparity(dataset / row["disp"], float(row["disparity_nodata"]))
-            layers = {
-                name: read_labels(dataset / row[column(name)])[0]
-                for name in US3D_TRUTH
-                if row.get(column(name))
-            }
-            pair = _Pair(row, *images, disparity, layers)
-            files, said = write(scratch, pair)
-            record = {name: row[name] for name in KEPT if name in row} | said
-            for kind, name in files.items():
-                record |= {kind: name, f"{kind}_sha256": file_sha256(scratch / name)}
-            table.append(record)
+        if layout in packages.NAMES:
+            load = partial(_sample, dataset)
+            table = packages.write_packages(scratch, rows, load, layout, license_name)
+        else:
+            reported = progress(rows, len(rows), f"dataset as {layout}: pairs")
+            table = [_write_pair(dataset, row, scratch, layout) for row in reported]
+            (scratch / "README.txt").write_text(OTHERS, encoding="utf-8")
         if table:
             write_table(scratch / "manifest.csv", table)
-        (scratch / "README.txt").write_text(OTHERS, encoding="utf-8")
     log.info("%s: %d pairs", out, len(rows))
     return len(rows)
+
+
+def _sample(dataset: Path, row: Mapping[str, str]) -> packages.Sample:
+    images = (read_image(dataset / row[view]) for view in ("left", "right"))
+    return packages.sample_of(row, *images, read_labels(dataset / row["disp"])[0])
+
+
+def _write_pair(
+    dataset: Path, row: Mapping[str, str], scratch: Path, layout: str
+) -> dict[str, Any]:
+    """Write a pair in the layout of kitti or us3d; its line of the manifest."""
+    images = (read_image(dataset / row[view]) for view in ("left", "right"))
+    disparity = read_disparity(dataset / row["disp"], float(row["disparity_nodata"]))
+    layers = {
+        name: read_labels(dataset / row[column(name)])[0]
+        for name in US3D_TRUTH
+        if row.get(column(name))
+    }
+    pair = _Pair(row, *images, disparity, layers)
+    files, said = {"kitti": _kitti, "us3d": _us3d}[layout](scratch, pair)
+    record = {name: row[name] for name in KEPT if name in row} | said
+    for kind, name in files.items():
+        record |= {kind: name, f"{kind}_sha256": file_sha256(scratch / name)}
+    return record
 
 
 def _put_png(path: Path, image: NDArray[Any]) -> None:

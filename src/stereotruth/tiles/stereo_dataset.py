@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError, in_number
 from ..core.products.files import files_below, plain_name, read_sealed
 from ..core.products.provenance import file_sha256
-from ..core.products.rasters import read_disparity, read_labels
+from ..core.products.rasters import read_disparity, read_image, read_labels
 from .manifest import NO_TRUTH, NONE, PATHS, SPLITS, SUM, manifest_rows
 from .manifest import column as column_of
 from .seals import Seal
@@ -177,6 +177,44 @@ class StereoDataset:
         if values.dtype == np.uint8:
             return values
         return np.where(values == np.float32(nodata), np.float32(np.nan), values)
+
+
+class StereoTiles:
+    """The labelled pairs of a split by the conventions of torchgeo's datasets.
+
+    A sample is a dict of tensors: ``image`` float32 [2, C, h, w], left and right in digital
+    numbers; ``disparity`` float32 [h, w], x_left − x_right in px, NaN where there is no label;
+    ``mask`` bool [h, w], where there is one. ``transforms`` takes and returns such a dict.
+
+    Raises InputError if the split has no labelled pair.
+    """
+
+    def __init__(
+        self,
+        root: str | Path = "dataset",
+        split: str = "train",
+        transforms: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+        *,
+        layout: str = "stereotruth",
+        nodata: float = -999.0,
+    ) -> None:
+        self.dataset = StereoDataset(Path(root).name, root, layout, (-(2**15), 2**15), nodata)
+        self.pairs = self.dataset.pairs(split, labelled=True)
+        self.transforms = transforms
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        import torch  # which no other reader of datasets needs
+
+        pair = self.pairs[index]
+        views = np.stack([read_image(file) for file in (pair.left, pair.right)])
+        views = views[:, None] if views.ndim == 3 else np.moveaxis(views, -1, 1)
+        disparity = torch.from_numpy(self.dataset.labels(pair))
+        image = torch.from_numpy(views.astype(np.float32))
+        sample = {"image": image, "disparity": disparity, "mask": torch.isfinite(disparity)}
+        return sample if self.transforms is None else self.transforms(sample)
 
 
 def find_pairs(root: str | Path, layout: str) -> list[Pair]:

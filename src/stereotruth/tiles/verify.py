@@ -18,7 +18,7 @@ log = logging.getLogger("stereotruth")
 # files that the manifest does not list; STYLE is the user's to change
 LOOSE = (
     *("manifest.csv", "export.json", "README.txt", FOOTPRINTS, STYLE, STATUS_COLOURS_FILE),
-    *("croissant.json", "stac/collection.json", "stac/rpc/*"),
+    *("README.md", "croissant.json", "stac/collection.json", "stac/rpc/*"),
     *("satnerf/pts3d.npy", "colmap/frame.json", "colmap/sparse/0/*.txt"),
 )
 

@@ -67,7 +67,11 @@ def verdict(bias, error, limits):
         "rows": {"parallax": plain, "tilt_x": plain, "tilt_y": plain},
         "labels": {"labelled": 0.8, "strays": [], "outside": 0.0, "spikes": [], "step": None},
         "convention": {"taken": "as stated"},
-        "bias": {"matches": 500, "bias": [bias, error, 40], "tilt_x": plain, "tilt_y": plain},
+        "bias": {
+            "matches": 500,
+            "bias": [bias, error, 40],
+            **dict.fromkeys(("tilt_x", "tilt_y", "scale"), plain),
+        },
         "contradicted": {"share": [0.001, 0.001, 40], "labels": 5000},
         "hidden": {"share": 0.0},
         "registration": {"move": [1, 0], "gain": [-0.1, 0.01, 40]},

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from importlib.metadata import version
+
 import numpy as np
 import pyproj
 import pytest
@@ -10,7 +13,7 @@ from scipy.optimize import least_squares
 
 from stereotruth.core.errors import InputError
 from stereotruth.epipolar.fit import fit_epipolar
-from stereotruth.epipolar.intersection import intersect, with_ground
+from stereotruth.epipolar.intersection import PLACE, coarse_place, intersect, with_ground
 from stereotruth.epipolar.model import EpipolarModel
 
 from ...synthetic.cameras import HEIGHT, LAT, LON
@@ -120,3 +123,36 @@ def test_a_grid_without_heights_is_refused(of_scene):
         with_ground(grid.drop_vars("height"))
     with pytest.raises(InputError, match="epipolar"):
         with_ground(grid.drop_attrs())
+
+
+@pytest.mark.parametrize("view", ["left", "right"])
+def test_maps_show_a_grid_within_the_stated_distance(of_scene, view):
+    """At the centres of pixels, at the reference height and over all heights of the model."""
+    attrs = coarse_place(of_scene, view)
+    assert tuple(sorted(attrs)) == tuple(sorted(PLACE)) and attrs["proj:code"] == "EPSG:4326"
+    a, b, c, d, e, f = attrs["spatial:transform"]
+    near, far = (float(m) for m in re.findall(r"([\d.]+) m (?:at|from)", attrs["place"]))
+    assert near < 1.0 < far
+    rows, cols = of_scene.shape
+    y, x = np.mgrid[5 : rows - 5 : 50, 5 : cols - 5 : 50].astype(float)
+    shown_lon, shown_lat = (p * (x + 0.5) + q * (y + 0.5) + r for p, q, r in ((a, b, c), (d, e, f)))
+    image, sensor_of = getattr(of_scene, f"{view}_image"), getattr(of_scene, view)
+    least, greatest = of_scene.height_range
+    levels = {least: far + 1.0, greatest: far + 1.0, of_scene.reference_height: near + 0.1}
+    for height, stated in levels.items():
+        lon, lat = sensor_of.localize(*image.inverse(x, y), height)
+        off = np.hypot((lon - shown_lon) * np.cos(np.radians(lat)), lat - shown_lat) * 111_320
+        assert np.nanmax(off) <= stated
+    west, south, east, north = attrs["spatial:bbox"]
+    assert west < np.nanmin(lon) < np.nanmax(lon) < east
+    assert south < np.nanmin(lat) < np.nanmax(lat) < north
+
+
+def test_rioxarray_reads_the_place(of_scene):
+    rioxarray = pytest.importorskip("rioxarray")
+    if tuple(map(int, version("rioxarray").split(".")[:2])) < (0, 22):
+        pytest.skip(f"rioxarray {rioxarray.__version__} does not know the conventions of GeoZarr")
+    attrs = coarse_place(of_scene)
+    grid = xr.Dataset({"disparity": (("y", "x"), np.ones((4, 6)))}, attrs=attrs)
+    assert grid.rio.crs.to_epsg() == 4326
+    assert list(grid.rio.transform())[:6] == attrs["spatial:transform"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.products.rasters import read_disparity, read_image
-from stereotruth.tiles.stereo_dataset import StereoDataset, find_pairs
+from stereotruth.tiles.stereo_dataset import StereoDataset, StereoTiles, find_pairs
 
 from ...synthetic.images import write
 from ...synthetic.real_data import PUBLISHED
@@ -161,3 +162,28 @@ def test_the_published_pairs_are_found():
     assert 0.1 < np.isnan(labels).mean() < 0.3 and np.nanmin(labels) > -96
     (pair,) = find_pairs(PUBLISHED / "whu", "whu")
     assert (pair.name, pair.city, pair.disparity) == ("KM_253", "Kunming", None)
+
+
+@pytest.mark.parametrize("bands", [1, 3])
+def test_samples_follow_the_conventions_of_torchgeo(tmp_path, bands):
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed")
+    folder = tmp_path / "with ground truth/train"
+    shape = (4, 6) if bands == 1 else (4, 6, 3)
+    left = np.arange(np.prod(shape), dtype=np.uint16).reshape(shape) + 40_000
+    labels = np.full((4, 6), -3.5, np.float32)
+    labels[1, 2] = -999
+    for kind, values in (("left", left), ("right", left + 1), ("disparity", labels)):
+        place = folder / ("disp" if kind == "disparity" else kind)
+        write(place / f"KM_{kind}_1.tiff", values)
+    tiles = StereoTiles(tmp_path, "train", lambda sample: sample | {"seen": True})
+    began = time.monotonic()
+    (sample,) = torch.utils.data.DataLoader(tiles, batch_size=None)
+    assert time.monotonic() - began < 2.0 and len(tiles) == 1 and sample["seen"]
+    assert sample["image"].dtype == sample["disparity"].dtype == torch.float32
+    assert sample["image"].shape == (2, bands, 4, 6) and sample["mask"].dtype == torch.bool
+    wanted = left[None] if bands == 1 else np.moveaxis(left, -1, 0)
+    np.testing.assert_array_equal(sample["image"][0], wanted)
+    assert torch.equal(sample["mask"], torch.from_numpy(labels != -999))
+    known = sample["mask"].numpy()
+    assert sample["disparity"].numpy()[known].tobytes() == labels[known].tobytes()
+    assert np.isnan(sample["disparity"][1, 2])

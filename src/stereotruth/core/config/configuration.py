@@ -192,11 +192,17 @@ class Tiles(Section):
 class Dataset(Section):
     """The configuration's section dataset."""
 
-    layouts: tuple[Literal["whu", "kitti", "us3d"], ...] = ("whu",)
+    layouts: tuple[Literal["whu", "kitti", "us3d", "webdataset", "parquet"], ...] = ("whu",)
     """what the target `dataset` writes: `dataset/` in the layout of the published WHU-Stereo
     (always); `dataset_kitti/` with 16-bit PNGs, which cannot hold negative disparities: right
     images are moved by `shift_px` of its manifest, so that the smallest disparity of each pair is 1
-    to 2 px; `dataset_us3d/` with RGB images of 8 bits"""
+    to 2 px; `dataset_us3d/` with RGB images of 8 bits; `dataset_webdataset/` and `dataset_parquet/`
+    with all labelled pairs in few large files, and a card for dataset hubs; `parquet` needs the
+    extra `catalog`"""
+
+    license: Text = "other"
+    """of the dataset, for the cards of `webdataset` and `parquet`: a name that dataset hubs know,
+    such as `cc-by-4.0`; images and LiDAR have terms of their own, which bind it"""
 
     catalogs: tuple[Literal["stac", "croissant"], ...] = ()
     """descriptions of `dataset/` in it: STAC (`stac/collection.json` and an item for each pair,
