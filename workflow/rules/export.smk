@@ -109,7 +109,7 @@ rule dataset:
             "acquired": SETTINGS.dataset.acquired,
         },
         layouts=[name for name in SETTINGS.dataset.layouts if name != "whu"],
-        license=SETTINGS.dataset.license,
+        licence=SETTINGS.dataset.licence,
         code=source_digest("stereotruth.tiles.layouts"),
     message:
         "Putting the cities together in the layout of the published dataset"

@@ -8,4 +8,4 @@ if __name__ == "__main__":
     with rule_job(snakemake, "dataset"):
         assemble_dataset(snakemake.input.tiles, dataset, **snakemake.params.catalogs)
         for layout, out in zip(snakemake.params.layouts, others, strict=True):
-            write_layout(dataset, out, layout, license_name=snakemake.params.license)
+            write_layout(dataset, out, layout, licence=snakemake.params.licence)

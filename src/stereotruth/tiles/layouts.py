@@ -226,11 +226,11 @@ class _Pair:
 
 
 def write_layout(
-    dataset: str | Path, out: str | Path, layout: str, *, license_name: str = "other"
+    dataset: str | Path, out: str | Path, layout: str, *, licence: str = "other"
 ) -> int:
     """Write the labelled pairs of ``dataset`` (rule dataset's) to ``out``; how many there are.
 
-    ``license_name``: of the card of webdataset and parquet.
+    ``licence``: of the card of webdataset and parquet.
 
     Raises InputError if the dataset has no manifest or an image cannot be written so.
     """
@@ -239,7 +239,7 @@ def write_layout(
     with atomic_folder(out) as scratch:
         if layout in packages.NAMES:
             load = partial(_sample, dataset)
-            table = packages.write_packages(scratch, rows, load, layout, license_name)
+            table = packages.write_packages(scratch, rows, load, layout, licence)
         else:
             reported = progress(rows, len(rows), f"dataset as {layout}: pairs")
             table = [_write_pair(dataset, row, scratch, layout) for row in reported]

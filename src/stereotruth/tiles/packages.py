@@ -70,7 +70,7 @@ def sample_of(row: Row, *arrays: NDArray[Any]) -> Sample:
 
 
 def write_packages(
-    folder: Path, rows: Sequence[Row], load: Callable[[Row], Sample], layout: str, license_name: str
+    folder: Path, rows: Sequence[Row], load: Callable[[Row], Sample], layout: str, licence: str
 ) -> list[dict[str, Any]]:
     """Write the pairs of ``rows`` and the card; lines of the manifest, with each pair's file.
 
@@ -101,7 +101,7 @@ def write_packages(
         features[name] = {f"array{len(shape)}_d": {"shape": list(shape), "dtype": dtype}}
     files = [{"split": of["name"], "path": f"data/{of['name']}-*"} for of in splits]
     front: dict[str, Any] = {
-        "license": license_name,
+        "license": licence,
         "tags": ["stereo-matching", "disparity", "satellite", "remote-sensing"],
         "configs": [{"config_name": "default", "data_files": files}],
     }
@@ -114,7 +114,7 @@ def write_packages(
         front=yaml.safe_dump(front, sort_keys=False),
         loading=LOADING[layout],
         nodata=" or ".join(sorted({row["disparity_nodata"] for row in rows})),
-        license=license_name,
+        license=licence,
     )
     (folder / "README.md").write_text(text, encoding="utf-8")
     return table

@@ -35,7 +35,7 @@ def dataset(request, exported, in_colour, tmp_path_factory) -> Path:
 @pytest.fixture
 def package(dataset, tmp_path, request) -> Path:
     out = tmp_path / request.param
-    assert write_layout(dataset, out, request.param, license_name="cc-by-4.0") >= 10
+    assert write_layout(dataset, out, request.param, licence="cc-by-4.0") >= 10
     assert defects(out) == []
     return out
 

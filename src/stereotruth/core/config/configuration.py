@@ -200,7 +200,7 @@ class Dataset(Section):
     with all labelled pairs in few large files, and a card for dataset hubs; `parquet` needs the
     extra `catalog`"""
 
-    license: Text = "other"
+    licence: Text = "other"
     """of the dataset, for the cards of `webdataset` and `parquet`: a name that dataset hubs know,
     such as `cc-by-4.0`; images and LiDAR have terms of their own, which bind it"""
 
