@@ -1,6 +1,9 @@
 """What ``stereotruth run`` shows of a run, by Snakemake's interface for loggers: `--logger
 stereotruth`. One line for each job that is done, with the time that the others will take; of a dry
 run a table of its rules. All else is in the logs: of Snakemake (.snakemake/log) and of the jobs.
+
+Every Snakemake of the environment imports its plug-ins when it starts: this one imports nothing of
+the package before a run asks for it.
 """
 
 from __future__ import annotations
@@ -13,8 +16,6 @@ import time
 
 from snakemake_interface_logger_plugins.base import LogHandlerBase
 from snakemake_interface_logger_plugins.common import LogEvent
-
-from stereotruth.core.job import NEWS_ONLY, failure_file, in_time
 
 COLUMNS = "rule", "jobs", "cores", "MB", "minutes"
 RESOURCES = "mem_mb", "runtime"
@@ -29,6 +30,8 @@ class LogHandler(LogHandlerBase):
     has_filter, has_formatter = True, True
 
     def __post_init__(self) -> None:
+        from stereotruth.core.job import NEWS_ONLY
+
         dry = self.common_settings.dryrun
         self.stream = sys.stdout if dry or self.common_settings.stdout else sys.stderr
         self.counts: dict[str, int] = {}  # jobs of the run by rule
@@ -84,6 +87,8 @@ class LogHandler(LogHandlerBase):
         record, start = self.jobs.pop(number, (None, 0.0))
         if record is None or self.common_settings.quiet:
             return
+        from stereotruth.core.job import in_time
+
         self.done += 1
         seconds = time.monotonic() - start
         self.took.setdefault(record.rule_name, []).append(seconds)
@@ -104,6 +109,8 @@ class LogHandler(LogHandlerBase):
         return left * (time.monotonic() - self.began) / max(sum(every), 1e-9)
 
     def _failed_job(self, record: logging.LogRecord) -> None:
+        from stereotruth.core.job import failure_file
+
         self.failed = True
         if not any(failure_file(log).exists() for log in record.log):
             logs = ", ".join(map(str, record.log)) or "no log"

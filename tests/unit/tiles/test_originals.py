@@ -31,7 +31,9 @@ from ...synthetic.tiled_scene import (
     PIXELS,
     SIZE,
     camera,
+    make_scene,
     rows_of,
+    run,
     surface,
     terrain,
     texture,
@@ -44,9 +46,9 @@ META = {"units": "m", "long_name": "test"}
 
 
 @pytest.fixture(scope="module")
-def cropped(exported: tuple[Path, dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cropped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("originals")
-    shutil.copytree(exported[0], folder / "Town")
+    run([make_scene(folder / "s1")], folder / "Town")
     row, col = np.indices((PIXELS, PIXELS)).astype(float)
     for view, sensor in CAMERAS.items():
         lon, lat, _ = surface(sensor, col, row)
