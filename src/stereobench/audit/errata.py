@@ -36,9 +36,11 @@ from stereotruth.core.numerics.statistics import reweighted_fit, tukey_weights
 from stereotruth.core.products.files import (
     atomic_folder,
     files_below,
+    is_foreign,
     path_below,
     read_record,
     read_table,
+    refuse_others,
     sealed,
     write_table,
 )
@@ -298,7 +300,11 @@ def write_errata(
 
 def read_errata(delta: str | Path) -> dict[str, Any]:
     """What the file of a folder of errata says. Raises InputError if it is not as it was made."""
-    return read_record(Path(delta, ERRATA), dict, what="errata", stage="audit")
+    try:
+        return read_record(Path(delta, ERRATA), dict, what="errata", stage="audit")
+    except InputError as error:
+        remedy = "get the folder again from who made it, or make it by audit --delta"
+        raise InputError(error.problem, file=error.file, remedy=remedy) from None
 
 
 def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int:
@@ -311,10 +317,9 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
     written, or if there is something at ``out``.
     """
     delta, dataset, out = Path(delta), Path(dataset), Path(out)
-    if out.exists():
-        raise InputError("is there already", file=out, remedy="name a new folder")
+    refuse_others(out, source=dataset)
     said = read_errata(delta)
-    files, found = list(files_below(dataset)), {}
+    files, found = [file for file in files_below(dataset) if not is_foreign(file.name)], {}
     for record in said["tiles"]:
         name = Path(path_below(record["disparity"], "the file of a pair", delta / ERRATA)).name
         same = [file for file in files if file.name == name]

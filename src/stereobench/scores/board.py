@@ -46,9 +46,9 @@ from .prediction_files import hold_against, read_prediction
 from .predictions import predict
 from .protocols import PROTOCOLS
 from .score_method import ScoringPlan, score
-from .scores import Scorer
+from .scores import MIN_TILES, Scorer
 from .strata import Products, exact_truth
-from .submissions import Entry, admit, read_admitted, refuse_borrowed
+from .submissions import Entry, offered, read_admitted, refuse_borrowed, write_admitted
 from .tables import Figure, error_figures, of_figures
 from .tables import Table as Differences
 
@@ -115,17 +115,18 @@ class Table:
 def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -> list[str]:
     """Write the site; returns what is said of each submission that was refused.
 
-    ``take_in``: admit what has not been before. Raises InputError if the settings or a dataset
-    cannot be used: a label is not as its manifest or its seal has it.
+    ``take_in``: admit what has not been before and is not refused. Raises InputError if the
+    settings or a dataset cannot be used: a label is not as its manifest or its seal has it.
     """
     settings = _settings(folder)
     places = sorted(path for path in (folder / "submissions").glob("*") if path.is_dir())
-    admitted = admit(folder, [p.name for p in places]) if take_in else read_admitted(folder)
+    known = read_admitted(folder)
+    admitted = known | (offered(folder, [p.name for p in places], known) if take_in else {})
     order = {name: k for k, name in enumerate(admitted)}
     places.sort(key=lambda path: (order.get(path.name, len(order)), path.name))
     tables = {name: _table(folder, name, settings) for name in settings.datasets}
     taken: list[Run] = []
-    refused = []
+    refused, remedies = [], []
     for place in places:
         try:
             entry = Entry.read(place, admitted)
@@ -133,12 +134,17 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
             taken.append(_score(folder, entry, tables))
         except InputError as error:
             refused.append(_said(error, place))
+            remedies.append(error.remedy)
+            if place.name not in known:
+                admitted.pop(place.name, None)
+    if take_in:
+        write_admitted(folder, admitted)
     for run in taken:
         table = tables[run.entry.facts["dataset"]]
         table.methods.setdefault(run.entry.method, []).append(run)
     with atomic_folder(to or folder / "site") as site:
         _write(site, settings, [of for of in tables.values() if of.methods], refused)
-    return [f"{of['file']}: {of['problem']}" for of in refused]
+    return [f"{of['file']}: {of['problem']}. Remedy: {how}" for of, how in zip(refused, remedies)]
 
 
 def _settings(folder: Path) -> BoardSettings:
@@ -148,7 +154,8 @@ def _settings(folder: Path) -> BoardSettings:
         if not isinstance(given, dict):
             raise ValueError("no keys")
     except (OSError, ValueError, yaml.YAMLError) as error:
-        problem = f"no settings of a board ({type(error).__name__})"
+        said = " ".join(str(error).split()) or type(error).__name__
+        problem = f"no settings of a board ({said})"
         raise InputError(problem, file=file, remedy="write title and datasets into it") from None
     return check(given, BoardSettings, file)
 
@@ -287,7 +294,12 @@ def _write(
             badge = _badge(row, len(rows), protocol["id"])
             _text(site / "badges" / f"{row['submissions'][0]}.svg", badge)
         maps = [_error_maps(site, table, run) for runs in table.methods.values() for run in runs]
-        shown.append((board, _ranking(rows, protocol), of_two.shown[0], sorted(maps)))
+        count = in_number(len(table.pairs), "pair")
+        too_few = [f"{count}: too few to tell methods apart, so that all of them have rank 1"]
+        too_few = too_few if len(table.pairs) < MIN_TILES else []
+        shown.append(
+            (board, count, too_few, _ranking(rows, protocol), of_two.shown[0], sorted(maps))
+        )
     every = {"software": f"stereotruth {__version__}", "confidence": CONFIDENCE, "boards": boards}
     _text(site / "board.json", _json({**every, "refused": refused}))
     _text(site / "papers_with_code.json", _json(_papers_with_code(settings.title, boards)))

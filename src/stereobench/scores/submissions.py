@@ -171,15 +171,16 @@ def read_admitted(folder: Path) -> dict[str, str]:
         ) from None
 
 
-def admit(folder: Path, names: Iterable[str]) -> dict[str, str]:
-    """Take in what has not been before; the list as it is then."""
-    known = read_admitted(folder)
-    for name in names:
-        if name not in known and (file := folder / "submissions" / name / FILE).is_file():
-            known[name] = file_sha256(file)
-    rows = [{"folder": name, "sha256": sha256} for name, sha256 in known.items()]
+def offered(folder: Path, names: Iterable[str], known: Mapping[str, str]) -> dict[str, str]:
+    """Checksums of ``submission.json`` of folders that have not been admitted."""
+    files = {name: folder / "submissions" / name / FILE for name in names if name not in known}
+    return {name: file_sha256(file) for name, file in files.items() if file.is_file()}
+
+
+def write_admitted(folder: Path, admitted: Mapping[str, str]) -> None:
+    """Write the list that :func:`read_admitted` reads."""
+    rows = [{"folder": name, "sha256": sha256} for name, sha256 in admitted.items()]
     write_table(folder / ADMITTED, rows, ("folder", "sha256"))
-    return known
 
 
 def refuse_borrowed(entry: Entry, earlier: Iterable[Entry]) -> None:

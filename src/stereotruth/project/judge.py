@@ -48,8 +48,10 @@ def score_surface_model(
     epoch: Annotated[str, typer.Option(help="Of the model's images, 2016.4 or a date.")] = "",
 ) -> None:
     """Judge any surface model: where it lies, its heights by surface and slope, edges of roofs."""
+    from ..core.products.files import refuse_others
     from .score_dsm import score_dsm
 
+    refuse_others(to, "scores.json")
     typer.echo(
         score_dsm(
             model,
@@ -121,6 +123,10 @@ def board(
     """
     from stereobench.scores.board import make_board
 
+    from ..core.products.files import refuse_others
+
+    if to is not None:
+        refuse_others(to, "board.json", folder / "submissions")
     refused = make_board(folder, to, take_in=admit)
     for line in refused:
         typer.echo(f"refused: {line}", err=True)
@@ -179,13 +185,17 @@ def audit(
 ) -> None:
     """Find faults of a stereo dataset from its files; with --delta write how to correct them."""
     from stereobench.audit.audit import audit as audit_dataset
-    from stereobench.audit.errata import read_errata
+    from stereobench.audit.errata import ERRATA, read_errata
 
     from ..core.config.methods import Audit
+    from ..core.products.files import refuse_others
     from ..tiles.stereo_dataset import StereoDataset
 
     if disparities[0] >= disparities[1]:
         raise InputError(f"--range {disparities} is empty", remedy="give the smallest one first")
+    refuse_others(to, "summary.json", dataset)
+    if delta is not None:
+        refuse_others(delta, ERRATA, dataset)
     given = StereoDataset(to.name, dataset, layout, disparities, nodata)
     work = to.with_name(f"{to.name}.work")
     summary = audit_dataset(given, to, Audit(), work=work, delta=delta)

@@ -86,7 +86,7 @@ def _run(folder: Path, target: str, cores: int | None) -> None:
     )
     if done.returncode:
         lines = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
-        told = [line for line in lines if "error:" in line] or lines[-SAID:]
+        told = dict.fromkeys(line for line in lines if "error:" in line) or lines[-SAID:]
         raise InputError(
             "\n".join(["the run ended without labels:", *told]),
             file=folder,

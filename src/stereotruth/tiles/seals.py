@@ -22,6 +22,7 @@ from ..core.products.files import (
     atomic_folder,
     path_below,
     read_record,
+    refuse_others,
     write_sealed,
     write_table,
 )
@@ -74,9 +75,10 @@ class Seal:
 def seal_dataset(root: str | Path, pairs: Iterable[Any], split: str, to: str | Path) -> str:
     """Write a copy of a dataset without the labels of a split; what to say of it.
 
-    ``pairs``: all of the dataset (:class:`.stereo_dataset.Pair`).
+    ``pairs``: all of the dataset (:class:`.stereo_dataset.Pair`); ``to``: a new folder.
     """
     root, to = Path(root), Path(to)
+    refuse_others(to, source=root)
     if Seal.of(root) is not None:
         raise InputError("sealed before", file=root / FILE, remedy="seal what it was made of")
     kept, held, labels = [], [], {}

@@ -25,6 +25,7 @@ from stereotruth.core.errors import InputError
 from stereotruth.core.products.files import write_table
 from stereotruth.core.products.grids import seal as seal_store
 from stereotruth.core.products.provenance import file_sha256
+from stereotruth.core.products.rasters import read_disparity
 from stereotruth.tiles.seals import open_seal, seal_dataset
 from stereotruth.tiles.stereo_dataset import StereoDataset, find_pairs
 
@@ -386,6 +387,23 @@ def test_what_is_not_admitted_is_refused_and_so_is_a_board_without_settings(made
     (top / "board.yaml").write_text("title: 1\n")
     with pytest.raises(InputError):
         make_board(top)
+
+
+def test_a_refused_submission_is_admitted_once_it_is_mended(made, tmp_path):
+    top = copied(made, tmp_path)
+    before = (top / ADMITTED).read_text()
+    place = top / "submissions/later"
+    shutil.copytree(top / "submissions/far", place)
+    seal(place, facts_of("far") | {"label": "Later", "licence": ""})
+    (line,) = make_board(top, take_in=True)
+    assert line.startswith(f"later/{FILE}: ") and "Remedy: " in line
+    assert (top / ADMITTED).read_text() == before
+    for file in sorted(place.glob("*.tif")):  # no copy of the other's
+        write(file, read_disparity(file) + np.float32(0.25))
+    seal(place, facts_of("far") | {"label": "Later"})
+    (place / ".snakemake_timestamp").touch()  # of the rule that packs
+    assert make_board(top, take_in=True) == []
+    assert (top / ADMITTED).read_text().startswith(before)
 
 
 def test_a_board_of_a_sealed_set_takes_no_other_labels(made, tmp_path):

@@ -57,6 +57,16 @@ def sealed(dataset: StereoDataset, to: Path) -> StereoDataset:
     return StereoDataset("set", to, dataset.layout, dataset.disparity_range)
 
 
+def test_nothing_that_is_there_is_replaced(dataset, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/gcps.csv").touch()
+    before = sorted(tmp_path.rglob("*"))
+    for to in (dataset.root, dataset.root / "public", tmp_path / "mine"):
+        with pytest.raises(InputError):
+            sealed(dataset, to)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_a_sealed_copy_is_matched_but_not_scored_until_it_is_opened(dataset, tmp_path):
     copy = sealed(dataset, tmp_path / "copy")
     assert [pair.disparity for pair in copy.pairs("test")] == [None, None]

@@ -41,6 +41,7 @@ FOREIGN = (  # what other programs leave beside the files that they open; in low
     "*.ovr",  # GDAL, QGIS: pyramids
     *("*.qgs", "*.qgz", "*.qgs~", "*.qgz~", "*.qml", "*.qmd", "*.points"),  # QGIS
     *(".ds_store", "._*", "thumbs.db", "desktop.ini", ".directory"),  # file managers
+    ".snakemake_timestamp",  # Snakemake, in folders that rules make
 )
 
 LONGEST_PATH = 1000  # bytes of a path below a folder
@@ -82,6 +83,22 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     finally:
         for rest in (scratch, old):
             shutil.rmtree(rest, ignore_errors=True)
+
+
+def refuse_others(folder: str | Path, made: str = "", source: str | Path | None = None) -> None:
+    """Raise InputError unless the folder that a user names for a product may be written.
+
+    It may if it is not there, is empty, or has the file ``made`` of the command that writes it:
+    then it is replaced. It must not lie in ``source``, the folder that the product is made of.
+    """
+    folder = Path(folder)
+    if source is not None and folder.resolve().is_relative_to(Path(source).resolve()):
+        raise InputError(f"lies in {source}", file=folder, remedy="name a folder beside it")
+    is_own = folder.is_dir() and (
+        not any(folder.iterdir()) or (bool(made) and (folder / made).is_file())
+    )
+    if folder.exists() and not is_own:
+        raise InputError("is there already", file=folder, remedy="name a new folder")
 
 
 def link(source: Path, target: Path) -> None:
