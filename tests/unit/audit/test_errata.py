@@ -240,8 +240,10 @@ def test_what_does_not_fit_is_refused_by_name(fault, download, tmp_path):
     else:
         out.mkdir()
         named = out
+        (out / "mine.csv").touch()
     with pytest.raises(InputError) as refusal:
         apply_errata(delta, root, out)
     assert str(named) in str(refusal.value)
-    assert not out.exists() or not list(out.iterdir())
+    assert [*out.glob("*")] == [*out.glob("mine.csv")]
+    assert (out / "mine.csv").exists() == (fault == "there")
     assert json.loads((delta / "errata.json").read_text())
