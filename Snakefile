@@ -13,6 +13,10 @@ min_version("9.10")
 shell.prefix("set -euo pipefail; export OPENBLAS_NUM_THREADS=1; ")
 
 
+# Of the working directory, for who runs jobs in a container (--sdm apptainer): see envs/README.md.
+container: "stereotruth.sif"
+
+
 include: "workflow/rules/refused.smk"
 
 
