@@ -76,3 +76,6 @@ def test_statuses_are_merged_in_one_order() -> None:
     assert before.tolist() == [[Status.LABELLED, Status.LABELLED_BETWEEN, Status.LABELLED]]
     assert np.array_equal(merged_status(edge, before), merged_status({**edge, **labelled}))
     assert set(PRECEDENCE) <= set(Status) and PRECEDENCE[-1] == Status.NO_POINTS
+    for without in (Status.MASKED, Status.OUT_OF_FRAME, Status.HIDDEN_IN_RIGHT, Status.CHANGED):
+        for label in (status for status in PRECEDENCE if status.carries_label):
+            assert merged_status({label: every, without: every}).tolist() == [[without] * 3]
