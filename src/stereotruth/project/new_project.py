@@ -10,6 +10,7 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 
 from ..core.errors import InputError
+from ..core.products.files import refuse_others
 from ..core.sheets import City, Scene
 from .project import FILES
 
@@ -63,10 +64,7 @@ def begin(folder: str | Path) -> str:
             remedy="stereotruth init FOLDER, or stereotruth init --example demo",
         )
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            "is there already, and not empty", file=folder, remedy="name a folder that is not there"
-        )
+    refuse_others(folder)
     (folder / "gcps").mkdir(parents=True)
     (folder / "config.yaml").write_text(configuration_text(), encoding="utf-8")
     for name, columns in (("scenes", Scene), ("cities", City)):

@@ -94,11 +94,12 @@ def refuse_others(folder: str | Path, made: str = "", source: str | Path | None 
     folder = Path(folder)
     if source is not None and folder.resolve().is_relative_to(Path(source).resolve()):
         raise InputError(f"lies in {source}", file=folder, remedy="name a folder beside it")
-    is_own = folder.is_dir() and (
-        not any(folder.iterdir()) or (bool(made) and (folder / made).is_file())
-    )
-    if folder.exists() and not is_own:
-        raise InputError("is there already", file=folder, remedy="name a new folder")
+    if made and (folder / made).is_file():
+        return
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            "is there already, and not empty", file=folder, remedy="name a folder that is not there"
+        )
 
 
 def link(source: Path, target: Path) -> None:
