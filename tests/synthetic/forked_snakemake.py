@@ -25,16 +25,20 @@ RUN = "SNAKEMAKE_OF_JOB"  # variable of the environment: number of the process t
 OF_JOBS = ("xarray", "rasterio", "matplotlib.figure", "rioxarray", "cv2", "scipy.optimize")
 
 
-@cache
 def planner() -> forks.Forker:
     """Forks Snakemake, with nothing of this package imported: a project may have its own."""
-    return forks.start(__name__)
+    return _start(os.environ.get("PYTHONUTF8"))
+
+
+def runner() -> forks.Forker:
+    """Forks Snakemake, whose jobs are forked, too, from a process that has all stages imported."""
+    return _start(os.environ.get("PYTHONUTF8"), "jobs")
 
 
 @cache
-def runner() -> forks.Forker:
-    """Forks Snakemake, whose jobs are forked, too, from a process that has all stages imported."""
-    return forks.start(__name__, "jobs")
+def _start(utf8: str | None, *of_jobs: str) -> forks.Forker:
+    """One for each ``PYTHONUTF8``, since a process reads that as it starts, and forks keep it."""
+    return forks.start(__name__, *of_jobs)
 
 
 def start_snakemake(
