@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Bools, Floats
 from ..core.products.files import write_table
 from ..core.products.provenance import describe, source_digest
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
@@ -54,8 +54,6 @@ from .gcp_checks import (
 from .images import open_view
 
 log = logging.getLogger("stereotruth")
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 
 POOR_SIGMA = 2.0  # px

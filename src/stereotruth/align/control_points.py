@@ -21,18 +21,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import continuous
 from ..core.products.files import of_text
 from ..core.tables import Table, decimal_number, epoch_year
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
-
-Floats = NDArray[np.float64]
-
 
 COLUMNS = ("id", "lon", "lat", "height", "left_col", "left_row", "right_col", "right_row")
 LONG = ("id", "lon", "lat", "height", "image", "col", "row")  # one line per point and image
@@ -71,12 +68,12 @@ class ControlPoints:
     remarks: tuple[str, ...] = ()
 
     @property
-    def in_left(self) -> NDArray[np.bool_]:
+    def in_left(self) -> Bools:
         """bool[n]: measured in the left image."""
         return np.isfinite(self.left[:, 0])
 
     @property
-    def in_right(self) -> NDArray[np.bool_]:
+    def in_right(self) -> Bools:
         """bool[n]: measured in the right image."""
         return np.isfinite(self.right[:, 0])
 

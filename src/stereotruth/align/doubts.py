@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, ndtri, stdtrit
 
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import metres_per_degree
 from ..core.numerics.statistics import robust_sigma
 from ..lidar.lattice import PER_M
@@ -28,10 +28,6 @@ from .align import CAREFUL_SIGMA
 from .alignment import Alignment, GcpResidual
 from .line_fit import LineFit
 from .shared_errors import SharedErrors, plan_slopes
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-
 
 LIDAR_SIGMA_M = 0.15  # m, vertical: what airborne surveys promise against their control
 LIDAR_PLAN_M = 0.3  # m, of east and of north: what they promise in plan
@@ -95,9 +91,7 @@ def heights_of_model(
     return (round(low - margin, 3), round(high + margin, 3)) if low <= high else None
 
 
-def _heights_around(
-    stores: Sequence[PointStore], gcp: GcpResidual, reach_m: float
-) -> NDArray[np.float64]:
+def _heights_around(stores: Sequence[PointStore], gcp: GcpResidual, reach_m: float) -> Floats:
     """Heights m of the points within ``reach_m`` of a control point, or of the AROUND nearest.
 
     None where there are fewer within WIDEST_M.

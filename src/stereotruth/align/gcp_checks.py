@@ -21,14 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, in_number
+from ..core.numerics.arrays import Bools, Floats
 from ..sensor.pair_geometry import GroundOfImages
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import rpc_file
 from .control_points import ControlPoints, TooFewPoints
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-
 
 MINIMAL = {"affine": 3, "similarity": 2, "shift": 1}  # points that determine the model
 BLUNDER_FLOOR = 1.25  # px: 5 sigma of a careful measurement (0.25 px)

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 from rasterio.errors import RasterioError
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import corners_of_hull, metres_per_degree, turn
 from ..core.products.rasters import open_raster
 from ..core.tables import acquisition_time
@@ -34,7 +34,6 @@ from ..sensor.rpc_files import read_rpc, rpc_file
 from ..sensor.site_pairs import SiteImage
 from .alignment import RPC_SHIFT, RPC_TILT
 
-Floats = NDArray[np.float64]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 Site = tuple[int, int, float, float]  # upper-left col, row px; lowest, highest point in m
 

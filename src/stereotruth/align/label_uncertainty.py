@@ -28,9 +28,10 @@ import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core.kernels import inner, kernel
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import exact_metres_per_degree
 from ..core.numerics.interpolation import between_four
 from ..epipolar.model import EpipolarModel
@@ -38,9 +39,6 @@ from ..lidar.lattice import CELL_BITS, LATTICE_DEG, cell_key
 from ..lidar.point_store import SQUARES
 from ..lidar.strips import StripOffsets
 from .alignment import Alignment
-
-Floats = NDArray[np.float64]
-
 
 STEP = 64  # px between the nodes; variances are quadratic in between, and at most too large there
 _UPPER = np.triu_indices(3)  # (d, d), (d, x), (d, y), (x, x), (x, y), (y, y)
@@ -241,7 +239,7 @@ def with_strips(
     return replace(uncertainty, nodes=uncertainty.nodes + nodes, step=STEP)
 
 
-def _taken(effects: Floats, x: Floats, y: Floats, known: NDArray[np.bool_]) -> Floats:
+def _taken(effects: Floats, x: Floats, y: Floats, known: Bools) -> Floats:
     """What an alignment takes of ``effects`` [rows, cols, 3] at places: the affine function that
     fits those of disparity best, and the mean of those of place.
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtr
 
+from ..core.numerics.arrays import Floats
 from ..core.numerics.statistics import TUKEY, huber_weights, robust_sigma, tukey_weights
 from ..sensor.rpc import LineCorrection, line_weights
 from .adjustment import (
@@ -35,9 +36,6 @@ from .adjustment import (
 )
 from .records import Equations
 from .shared_errors import WIDEST, Steps, amount, climb
-
-Floats = NDArray[np.float64]
-
 
 CELLS = 40  # of a spline over the lines: four a period where an image has ten
 LENGTHS = (1 / 32, 1 / 23, 1 / 16, 1 / 11, 1 / 8, 1 / 5.6, 1 / 4)  # of a process, in images

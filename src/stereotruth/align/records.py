@@ -9,15 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.statistics import median_and_nmad
 from ..core.products.files import atomic_file, read_record, sealed
 from ..sensor.rpc import LineCorrection, SensorModel, read_correction
 from .alignment import Alignment, ViewFit, gcp_of, over_the_image
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 MEANING = (
     "observed [along, across the epipolar rows; px] = design [2, 12] @ parameters + error, one row "
@@ -44,7 +41,7 @@ class Equations:
     design: Floats
     observed: Floats
     own: Floats
-    site: NDArray[np.int64]
+    site: Ints
     at: Floats
     there: Floats
 

@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.config.configuration import Rectify
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.numerics.statistics import robust_sigma
 from ..core.products.files import write_table
 from ..lidar.point_store import PointStore, open_stores
@@ -68,7 +68,6 @@ from .shared_errors import SharedErrors, place_pair, with_shared_errors
 from .tie_points import Geometry, common_shift, find_places, match
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 
 
 FINE = 6  # px: radius of the first search around every place

@@ -17,19 +17,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from ..core.numerics.geometry import metres_per_degree
 from ..core.numerics.statistics import TO_SIGMA
 from ..sensor.images import Source
 from ..sensor.rpc import SensorModel
 from .least_squares_matching import warp_patch
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
 
 STEP_M = 2.5  # m that a roof lies above what is beside it: more than cars, hedges and fences
 LENGTH_M, LENGTH_SPACINGS = 10.0, 10.0  # of an edge, at most: a wall of a house
@@ -72,7 +67,7 @@ class RoofEdges:
     end: Floats
     outward: Floats
     height: Floats
-    site: Integers
+    site: Ints
 
     def __len__(self) -> int:
         return self.site.size
@@ -315,7 +310,7 @@ class _Lines:
     """k lines beside edges: index int[k] of the ``edge``; ``offset`` px [k] along its normal;
     ``share`` [k] of the contrast of its edge."""
 
-    edge: Integers
+    edge: Ints
     offset: Floats
     share: Floats
 
@@ -383,7 +378,7 @@ def _estimate(
     return np.round(estimate, 6), normal, change * (weight * residual)[:, None]
 
 
-def _find_lines(source: Source, at: _Projected, sites: Integers, reach_m: float) -> _Lines:
+def _find_lines(source: Source, at: _Projected, sites: Ints, reach_m: float) -> _Lines:
     """Lines within ``reach_m`` of all edges; read site by site."""
     edge, offset, share = [], [], []
     for site in np.unique(sites):
@@ -408,7 +403,7 @@ def _find_lines(source: Source, at: _Projected, sites: Integers, reach_m: float)
 
 
 def _lines_across(
-    picture: NDArray[np.float32], start: Floats, end: Floats, normal: Floats, reach: float
+    picture: Singles, start: Floats, end: Floats, normal: Floats, reach: float
 ) -> tuple[Floats, Floats]:
     """Offsets px [k] along the ``normal`` at which lines along an edge stand out in a picture, and
     their contrast [k]; none where the picture does not show all of it."""

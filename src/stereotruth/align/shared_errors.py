@@ -21,10 +21,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.geometry import metres_per_degree
 from ..lidar.point_store import PointStore, query_points
 from ..sensor.images import Source
@@ -36,7 +36,6 @@ from .records import Equations, PlanObservation
 from .roof_edges import ROOF_RIM_M, PlanOffset, RoofEdges, find_roof_edges, plan_offset
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 
 
 CHANCE = 0.05  # probability of such a rise of the likelihood where sites share nothing
@@ -232,8 +231,8 @@ def _counted(
     found: Estimate,
     equations: Equations,
     shared: SharedErrors,
-    index: NDArray[np.int64],
-    known: NDArray[np.bool_],
+    index: Ints,
+    known: Bools,
     at: Floats,
 ) -> tuple[Estimate, SharedErrors]:
     """The estimate by generalised least squares, with the errors that are shared."""

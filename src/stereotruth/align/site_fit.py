@@ -21,9 +21,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.statistics import huber_weights, robust_sigma, tukey_weights
 from ..sensor.rpc import LineCorrection
 from .adjustment import FREE, MATCHING, Estimate, Sums, estimate
@@ -42,8 +42,6 @@ from .line_fit import (
 from .records import Equations, PairEquations, PlanObservation, SiteLines
 from .shared_errors import PlanFrame, shared_spread, with_offsets, with_shared_errors
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 STEPS = 60  # of the reweighting, at most
 SETTLED_PX = 1e-6  # change of a step after which no other follows
 FIRST_STEPS = 12  # with weights that leave nothing out: the start is not robust
@@ -96,7 +94,7 @@ def fit_site_lines(
         found[image] = LineCorrection((0.0, rows[image] - 1.0), np.round(values, 6))
     padded = np.pad(covariance, (0, 1))  # nothing is unknown of an image without a start
 
-    def own_unknowns(pair: PairOfLines) -> NDArray[np.int64]:
+    def own_unknowns(pair: PairOfLines) -> Ints:
         of_images = [start[k] + np.arange(2 * rank) if k in start else np.full(2 * rank, -1)
                      for k in pair.images]  # fmt: skip
         return np.concatenate(of_images)
@@ -123,7 +121,7 @@ def _of_pair(
     start: Mapping[int, int],
     count: int,
     known: SiteLines,
-) -> tuple[NDArray[np.int64], Floats, Floats]:
+) -> tuple[Ints, Floats, Floats]:
     """Which unknowns a pair tells of, its design [n, 2, p] of them and observations [n, 2], in
     standard deviations of its matches."""
     equations = pair.equations
@@ -239,7 +237,7 @@ class SiteFit:
         return self.covariance[np.ix_(index, index)]
 
 
-def _six(k: int) -> NDArray[np.int64]:
+def _six(k: int) -> Ints:
     return np.arange(6 * k, 6 * k + 6)
 
 
@@ -249,7 +247,7 @@ class _Points:
 
     design: Floats
     delta: Floats
-    index: NDArray[np.int64]
+    index: Ints
 
     @classmethod
     def of(cls, images: Sequence[ImageToFit], lines: SiteLines) -> _Points:
@@ -281,7 +279,7 @@ class _Pair:
     """A pair's normal equations; ``index`` [12] of its parameters among all."""
 
     scene: str
-    index: NDArray[np.int64]
+    index: Ints
     equations: Equations
     estimate: Estimate
     sums: Sums

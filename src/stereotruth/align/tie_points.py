@@ -20,8 +20,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from ..core.numerics.interpolation import SIX_POINT_RADIUS
 from ..core.numerics.statistics import median_and_nmad, robust_sigma
 from ..epipolar.resampling import ANTIALIAS
@@ -31,12 +31,6 @@ from ..sensor.rpc import SensorModel
 from .images import IS_FIRM, MARGIN, SITE, Site, query_box
 from .least_squares_matching import least_squares_match, warp_patch
 from .tie_planes import GUARDS, HALF, MIN_POINTS, SIDE, Guard, SitePoints
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Integers = NDArray[np.int64]
-Picture = NDArray[np.float32]
-
 
 PER_SIDE = 3  # places per side of a site, at most
 STEP = 4  # px between the candidates for a place
@@ -58,7 +52,7 @@ class Places:
     ``clear`` [n, SIDE, SIDE]: pixels of the window that show the plane alone, by ``guard``.
     """
 
-    site: Integers
+    site: Ints
     lon: Floats
     lat: Floats
     height: Floats
@@ -70,7 +64,7 @@ class Places:
         return self.site.size
 
 
-def _shift_information(picture: Picture) -> tuple[Floats, Floats, Floats]:
+def _shift_information(picture: Singles) -> tuple[Floats, Floats, Floats]:
     """Information of each pixel [k, k] about a shift: products xx, xy, yy of its slopes, saturated.
 
     A pixel of the median slope of the picture counts a half, none more than one: texture is wanted,
@@ -94,8 +88,8 @@ def _window_sums(values: Floats) -> Floats:
 
 
 def _candidates(
-    information: tuple[Floats, Floats, Floats], share: Floats, at: Integers
-) -> tuple[Integers, Integers]:
+    information: tuple[Floats, Floats, Floats], share: Floats, at: Ints
+) -> tuple[Ints, Ints]:
     """Part of the site [n] and index [n] of the most promising windows, TRIED at most of each of
     PER_SIDE² parts.
 
@@ -155,7 +149,7 @@ def _site_points(
     )
 
 
-def _places_of(points: SitePoints, picture: Picture) -> list[tuple[Integers, Floats, Bools]]:
+def _places_of(points: SitePoints, picture: Singles) -> list[tuple[Ints, Floats, Bools]]:
     """The places of a site by each of GUARDS: (col, row) px [n, 2] in its ``picture`` [SITE, SITE],
     planes [n, 3], clear pixels [n, SIDE, SIDE]."""
     at = np.arange(HALF + 1, SITE - HALF - 1, STEP)
@@ -183,7 +177,7 @@ def _information_of(own: Sequence[Floats], pixels: Bools) -> Floats:
     return _smaller_eigenvalue(*(np.where(pixels, values, 0.0).sum(axis=(1, 2)) for values in own))
 
 
-def _best_of_parts(part: Integers, score: Floats) -> list[int]:
+def _best_of_parts(part: Ints, score: Floats) -> list[int]:
     """The candidate of each ``part`` [k] that has the greatest ``score`` [k], if that is enough."""
     best: dict[int, int] = {}
     for k in np.flatnonzero(score >= MIN_INFORMATION).tolist():
@@ -235,7 +229,7 @@ class TiePoints:
     match's own residuals; ``correlation`` of the windows.
     """
 
-    site: NDArray[np.int64]
+    site: Ints
     height: Floats
     left: Floats
     right: Floats
@@ -261,7 +255,7 @@ def _carry(
     return at[:, 0], carry
 
 
-def _window(source: Source, at: Floats, reach: float) -> tuple[Picture, Floats] | None:
+def _window(source: Source, at: Floats, reach: float) -> tuple[Singles, Floats] | None:
     """The part of an image around positions [n, 2], and the position of its first pixel."""
     low = np.maximum(np.floor(at.min(axis=0) - reach).astype(int), 0)
     high = np.minimum(np.ceil(at.max(axis=0) + reach).astype(int) + 1, source.size)
@@ -281,13 +275,13 @@ class _Windows:
     """One place, ready for matching: see :func:`_prepared`."""
 
     index: int
-    template: Picture
+    template: Singles
     clear: Floats
-    pixels: Picture
+    pixels: Singles
     at: Floats
     carry: Floats
     scale: tuple[float, float]
-    scores: Picture
+    scores: Singles
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +316,7 @@ class Geometry:
         return cls(where, height, at, carry, along)
 
 
-def _even(picture: Picture) -> Picture:
+def _even(picture: Singles) -> Singles:
     """A picture without the brightness of its surroundings, and no pixel above the usual contrast.
 
     So that an edge that stands out has no more say than the texture around it; 0 where the picture

@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.aoi import AreaOfInterest
 from pyproj.crs import Datum, GeographicCRS
@@ -30,9 +29,9 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import turn
 
-Floats = NDArray[np.float64]
 Place = tuple[Floats, Floats, Floats]
 
 NAME = "ITRF2020"

@@ -14,15 +14,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.geometry import DEGREE_M, metres_per_degree
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Box = tuple[float, float, float, float]
 
 LATTICE_DEG = 1e-9
@@ -118,11 +115,11 @@ class Footprint:
         return cell_m2(self.row + np.arange(self.held.shape[0]))
 
     @cached_property
-    def _sums(self) -> Integers:
+    def _sums(self) -> Ints:
         """Summed-area table of the cells."""
         return np.pad(self.held, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
 
-    def contains(self, lattice: Integers) -> Bools:
+    def contains(self, lattice: Ints) -> Bools:
         """Which points lie in it: lattice longitude and latitude [2 or more, n]."""
         inside = np.empty(lattice.shape[1], np.bool_)
         _mark(lattice, self.held, self.row, self.col, inside)
@@ -142,7 +139,7 @@ class Footprint:
         each = (CELL_DEG * DEGREE_M) ** 2 * np.cos(np.radians(lat))
         return float((cells - count) @ each)
 
-    def _count(self, boxes: Floats) -> tuple[Integers, Integers]:
+    def _count(self, boxes: Floats) -> tuple[Ints, Ints]:
         """How many cells of boxes are its own, and how many there are."""
         at = np.floor(np.asarray(boxes, np.float64).reshape(-1, 4) / CELL_DEG)
         at = np.clip(at, -(2**31), 2**31).astype(np.int64)
@@ -176,7 +173,7 @@ def _runs(outline: Floats, east: float, north: float) -> list[list[int]]:
 
 
 @kernel
-def _mark(lattice: Integers, held: Bools, row: int, col: int, inside: Bools) -> None:
+def _mark(lattice: Ints, held: Bools, row: int, col: int, inside: Bools) -> None:
     """Set ``inside`` to whether the cell of each point is held."""
     for i in range(inside.size):
         y, x = (lattice[1, i] >> CELL_BITS) - row, (lattice[0, i] >> CELL_BITS) - col

@@ -34,6 +34,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..core.errors import InputError, in_number
+from ..core.numerics.arrays import Bools, Floats
 from ..core.products.file_parts import (
     GLANCE_BYTES,
     LocalParts,
@@ -46,9 +47,8 @@ from ..core.products.remote_files import AT_ONCE, hosts_of, read_bytes, url_of
 from .catalogue_list import EPT
 from .las_files import FIELDS, LAYERED, Layout, check_layout, decoding, records, require
 
-Floats = NDArray[np.float64]
 Numbers = NDArray[np.intp]
-Touches = Callable[[Floats, Floats], NDArray[np.bool_]]
+Touches = Callable[[Floats, Floats], Bools]
 """Which boxes, by lowest and highest corners [n, 3], may hold points that are wanted."""
 
 NODE = np.dtype([("key", "<i4", 4), ("start", "<i8"), ("bytes", "<i8"), ("points", "<i8")])

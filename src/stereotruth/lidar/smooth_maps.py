@@ -18,12 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 Exact = Callable[[Floats, Floats, Floats], tuple[Floats, Floats, Floats]]
 
 PATCH_M, SLAB_M = 500.0, 1000.0

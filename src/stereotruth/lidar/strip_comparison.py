@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from ..core.numerics.arrays import Floats, Ints
 from ..core.numerics.geometry import DEGREE_M, exact_metres_per_degree
 from ..core.numerics.statistics import robust_sigma, tukey_weights
 from .lattice import CELL_BITS, CELL_DEG, LATTICE_DEG, LATTICE_M
@@ -30,9 +31,6 @@ from .point_fields import BIN_S, EDGES, SOURCE, TIME, runs_of
 from .point_store import SQUARES as CELL_SQUARES
 from .point_store import Points, PointStore
 from .strips import SHARE, Strip, StripKey, StripOffsets, more_of
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LEAST_SHARE = 0.002  # of a cell's points: fewer are compared with nothing
 SQUARES = (64, 32, 16)  # along a side of a cell, of 1.8, 3.7, 7.3 m; as small as points allow

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..core.numerics.arrays import Floats
 
 Place = tuple[float, float]  # longitude, latitude, degrees
 Sun = tuple[float, float]  # azimuth from north over east, elevation, degrees
@@ -335,7 +336,7 @@ def sun_over(time: datetime, lon: float, lat: float) -> Sun:
     return math.degrees(azimuth) % 360.0, math.degrees(elevation)
 
 
-def toward_sun(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
+def toward_sun(azimuth_deg: float, elevation_deg: float) -> Floats:
     """Unit vector [3] (east, north, up) toward the sun."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     level = math.cos(elevation)

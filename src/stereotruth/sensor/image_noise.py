@@ -24,12 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from ..core.numerics.windows import window_sums
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 STEPS = 8.0  # whole numbers that a standard deviation of the noise spans in images of equal noise
 EQUAL = STEPS**2, STEPS**2  # variances of the noise of two such images
@@ -236,9 +232,7 @@ def _by_brightness(brightness: Floats, _greatest: Floats, rough: Floats) -> Nois
     return NoiseCurve(tuple(levels), tuple(deviations))
 
 
-def detail(
-    image: NDArray[np.floating], noise: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def detail(image: NDArray[np.floating], noise: float) -> tuple[Singles, Singles]:
     """Detail [h, w] of an image [h, w] of whole numbers (DN), by the variance of its ``noise``; and
     the share of it that is signal, over the SIGNAL_PX² around each pixel.
 

@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import exact_metres_per_degree
 from .rpc import SensorModel
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 MIN_CONVERGENCE = 1.0  # degrees
 LEAST_BASE = 1e-5  # difference of two unit rays; with less, both images look from one place

@@ -18,13 +18,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import continuous
 from ..core.numerics.interpolation import cubic_weights
-
-Floats = NDArray[np.float64]
 
 # The packed form: ten offsets and scales, coefficients, the affine.
 SAMP_NUM, SAMP_DEN, LINE_NUM, LINE_DEN, AFFINE = 10, 30, 50, 70, 90

@@ -23,14 +23,13 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import DEGREE_M
 from .deliveries import Acquisition, between_suns, shadow_shift
 from .pair_geometry import frame, inside, ray_upwards, view_order
 from .rpc import SensorModel
 
-Floats = NDArray[np.float64]
 Names = tuple[str, str]  # of a pair's images
 
 SAMPLES = 65  # along each side of an image, of the ground that it shares
