@@ -112,7 +112,7 @@ class System:
         return np.column_stack([np.eye(2) + linear, shift])
 
 
-def trimmed(system: System, seed: int) -> Bools:
+def trimmed(system: System) -> Bools:
     """The half of the points (and a little more) that agree best: least trimmed squares.
 
     Each minimal sample starts concentration steps: fit, keep the h points that fit best, repeat.
@@ -126,7 +126,7 @@ def trimmed(system: System, seed: int) -> Bools:
     if math.comb(n, k) <= MAX_SAMPLES:
         samples = np.array(list(itertools.combinations(range(n), k)))
     else:
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         samples = np.array([rng.choice(n, k, replace=False) for _ in range(MAX_SAMPLES)])
     kept = np.zeros((len(samples), n))
     np.put_along_axis(kept, samples, 1.0, axis=1)
@@ -165,18 +165,18 @@ def studentised(system: System, used: Bools) -> Floats:
     return lengths / np.sqrt(np.maximum(variance, 1e-6))
 
 
-def find_blunders(system: System, *, floor: float, seed: int) -> tuple[Bools, Floats, float]:
+def find_blunders(system: System) -> tuple[Bools, Floats, float]:
     """Which points are used, the studentised residuals [n] in px, and the threshold in px."""
     n = len(system.delta)
     if n <= system.minimal + 1:  # nothing to tell a blunder from the others
         used = np.ones(n, dtype=bool)
         return used, np.zeros(n), np.inf
-    used = trimmed(system, seed)
+    used = trimmed(system)
     for _ in range(30):
         lengths = studentised(system, used)
         sigma = float(np.median(lengths)) / RAYLEIGH_MEDIAN
         # Wider for few points, whose deviation is not well known (as Student's t is).
-        threshold = (1 + 1 / (n - system.minimal)) * max(floor, BLUNDER_SIGMAS * sigma)
+        threshold = (1 + 1 / (n - system.minimal)) * max(BLUNDER_FLOOR, BLUNDER_SIGMAS * sigma)
         again = lengths <= threshold
         if again.sum() <= system.minimal or (again == used).all():
             break

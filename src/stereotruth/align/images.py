@@ -47,6 +47,7 @@ MOST_DEGREES = 10.0  # along a side of a footprint: more is none of one site
 SITES = 120  # about; each is read by itself
 SITE = 168  # px of the left image, side of a site
 MARGIN = 24  # px around a site whose points are looked at
+NEAR_DEG = 1e-5  # around a place whose cells tell the heights of its points
 NOT_FIRM = (3, 4, 5, 9)  # ASPRS classes: vegetation, and water, which moves
 IS_FIRM = ~np.isin(np.arange(256), NOT_FIRM)  # by class
 PIXEL_M = (0.01, 1000.0)  # m on the ground
@@ -268,53 +269,10 @@ def _hull(places: Sequence[tuple[Floats, Floats]]) -> Floats:
     return ground[:, corners_of_hull(*ground)]
 
 
-def _heights_of_points(
-    stores: Sequence[PointStore], lon: float, lat: float, reach: float
-) -> tuple[float, float] | None:
-    """Lowest and highest point (m) of the cells around a place; None where there are none."""
-    box = lon - reach, lat - reach, lon + reach, lat + reach
-    found = [
-        store.height_range(*box)
-        for store in stores
-        if store.bounds[0] <= box[2]
-        and store.bounds[2] >= box[0]
-        and store.bounds[1] <= box[3]
-        and store.bounds[3] >= box[1]
-    ]
-    found = [pair for pair in found if pair is not None]
-    return (min(p[0] for p in found), max(p[1] for p in found)) if found else None
-
-
-def _covered(
-    left: SensorModel,
-    right: SensorModel,
-    right_size: tuple[int, int],
-    stores: Sequence[PointStore],
-    height: float,
-    col: float,
-    row: float,
-) -> tuple[float, float] | None:
-    """Range of heights (m) at a left position that LiDAR and right image cover, else None.
-
-    ``height``: about that of the ground.
-    """
-    low = high = height
-    for _ in range(3):
-        lon, lat = (float(v) for v in left.localize(col, row, (low + high) / 2))
-        if not np.isfinite(lon):
-            return None
-        there = _heights_of_points(stores, lon, lat, 1e-5)
-        if there is None:
-            return None
-        low, high = there
-    c, r = right.project(lon, lat, (low + high) / 2)
-    return (low, high) if 0 <= c < right_size[0] and 0 <= r < right_size[1] else None
-
-
 def choose_sites(
     left: SensorModel,
     right: SensorModel,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
+    sizes: Sizes,
     stores: Sequence[PointStore],
     height: float,
 ) -> list[Site]:
@@ -328,12 +286,26 @@ def choose_sites(
     if min(cols, rows) < SITE:
         return []
 
+    def covered(col: float, row: float) -> tuple[float, float] | None:
+        """Range of heights at a left position that LiDAR and right image cover."""
+        low = high = height
+        for _ in range(3):
+            lon, lat = (float(v) for v in left.localize(col, row, (low + high) / 2))
+            if not np.isfinite(lon):
+                return None
+            box = lon - NEAR_DEG, lat - NEAR_DEG, lon + NEAR_DEG, lat + NEAR_DEG
+            there = [pair for store in stores if (pair := store.height_range(*box))]
+            if not there:
+                return None
+            low, high = min(pair[0] for pair in there), max(pair[1] for pair in there)
+        c, r = right.project(lon, lat, (low + high) / 2)
+        return (low, high) if 0 <= c < sizes[1][0] and 0 <= r < sizes[1][1] else None
+
     def grid(spacing: float) -> list[Site]:
         found = []
         for row in np.arange(spacing / 2, rows, spacing):
             for col in np.arange(spacing / 2, cols, spacing):
-                heights = _covered(left, right, sizes[1], stores, height, col, row)
-                if heights is not None:
+                if (heights := covered(col, row)) is not None:
                     corner = (
                         min(max(int(at) - SITE // 2, 0), n - SITE)
                         for at, n in zip((col, row), (cols, rows))
@@ -348,12 +320,11 @@ def choose_sites(
 def query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | None:
     """(west, south, east, north) of all points that either image may show in a site, degrees."""
     col0, row0, low, high = site
-    corner_cols, corner_rows = (
-        c.ravel() for c in np.meshgrid([-MARGIN, SITE + MARGIN], [-MARGIN, SITE + MARGIN])
-    )
+    ends = np.array([-MARGIN, SITE + MARGIN])
+    corners = [axis.ravel() for axis in np.meshgrid(col0 + ends, row0 + ends)]
     middle = (low + high) / 2
-    ground = [left.localize(col0 + corner_cols, row0 + corner_rows, z) for z in (low, high)]
-    at_right = right.project(*left.localize(col0 + corner_cols, row0 + corner_rows, middle), middle)
+    ground = [left.localize(*corners, z) for z in (low, high)]
+    at_right = right.project(*left.localize(*corners, middle), middle)
     ground += [right.localize(*at_right, z) for z in (low, high)]
     ground = np.hstack([np.stack(g) for g in ground])
     if not np.isfinite(ground).all():
