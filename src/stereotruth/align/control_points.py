@@ -1,17 +1,11 @@
 """Reading of control and check points: ground coordinates with their measured image positions.
 
-A CSV of the columns ``id,lon,lat,height,left_col,left_row,right_col,right_row``: WGS 84 longitude
-and latitude in degrees, ellipsoidal height in m, and (col, row) in px of each original image, pixel
-(0, 0) being the centre of the upper-left pixel. Both cells of a view are empty where it does not
-see the point.
-
-Lines that begin with ``#`` are remarks. ``# frame: EPSG:6318`` names the geographic system of
-the ground coordinates where this is not WGS 84, ``# epoch: 2016.4`` their epoch where the frame is
-dynamic, or WGS 84 (ITRF) at another date than that of the images. Points are brought to ITRF2020 at
-the epoch of the city's images (:mod:`stereotruth.lidar.frames`).
-
-Or the long form, one line per point and image, which serves all pairs of a site: ``id,lon,lat,
-height,image,col,row``, ``image`` being a name of the images sheet.
+A CSV of the columns ``id,lon,lat,height,left_col,left_row,right_col,right_row``: WGS 84 degrees,
+ellipsoidal height in m, and (col, row) in px of each original image, both empty where a view does
+not see the point. Or the long form, one line per point and image of a site: ``id,lon,lat,height,
+image,col,row``, ``image`` being a name of the images sheet. Lines that begin with ``#`` are
+remarks; ``# frame:`` and ``# epoch:`` say what the ground coordinates are where they are not WGS 84
+at the date of the images (docs/explanation/frames.md).
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
 """Doubts and remarks in words: the LiDAR's heights, images of a site, why labels are less sure.
 
-A fault of the vertical datum (geoid left out or added twice, feet for metres, another zero) moves
-the LiDAR along the vertical, which the images see as a shift of both, each along its own line of
-sight. Three witnesses can tell it: the heights of the control points; the tie points, against what
-the alignment's uncertainty allows; and without control points the RPCs, whose errors have no
-reason to look like a fault of heights. Nothing else in the data can: with a pair of RPCs that are
-off by an unknown amount, a common vertical shift is a change of both images like any other.
+A fault of the vertical datum moves the LiDAR along the vertical, which the images see as a shift of
+both, each along its own line of sight. Three witnesses tell it: the heights of the control points;
+the tie points, against what the alignment's uncertainty allows; and without control points the
+RPCs, whose errors have no reason to look like a fault of heights (docs/planted_errors.md).
 """
 
 from __future__ import annotations

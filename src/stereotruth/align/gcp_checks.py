@@ -1,11 +1,10 @@
 """Which ground control points are blunders, and what is refused of them before and after the fit.
 
-Robust least squares of small corrections in image space: affine, similarity or shift. Blunders are
-found by least trimmed squares over all minimal samples (Rousseeuw & Van Driessen 2006, "Computing
-LTS regression for large data sets"), then by studentised residuals; the result is the exact
-least-squares solution (by ``cv2.solve``) on the other points. ``cv2.estimateAffine2D``, the paper's
-way, draws random samples and refines its result only in part, so that it depends on the order of
-the points. What is refused names the remedy, and the file if it is not that of the points.
+Blunders are found by least trimmed squares over all minimal samples (Rousseeuw & Van Driessen 2006,
+"Computing LTS regression for large data sets"), then by studentised residuals. The result is the
+exact least-squares solution (``cv2.solve``) on the other points. ``cv2.estimateAffine2D``, the
+paper's way, depends on the order of the points. What is refused names the remedy, and the file if
+it is not that of the points.
 """
 
 from __future__ import annotations

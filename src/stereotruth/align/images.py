@@ -1,10 +1,9 @@
 """Images of a pair or a site, opened; the ground of a pair by their RPCs, and sites all over it.
 
-The ground of a pair is that whose LiDAR can have a say in its products. It is known before LiDAR is
-read and before anything is aligned: by the RPCs, with what they may be off and with the heights
-that they are made for. Labels follow from points that the pair's epipolar grid shows, and from
-points on the rays from there to both cameras; heights of an original image from what its frame
-shows. Whether the LiDAR that was read is enough is asked again with the aligned images.
+The ground of a pair is that whose LiDAR can have a say in its products, by the RPCs with what they
+may be off and the heights that they are made for: labels follow from points that the pair's
+epipolar grid shows, and on the rays from there to both cameras; heights of an original image from
+what its frame shows.
 """
 
 from __future__ import annotations

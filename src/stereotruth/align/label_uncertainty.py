@@ -1,25 +1,12 @@
 """What the uncertainty of an alignment means for labels: of their disparity at a fixed pixel.
 
-An alignment that is off moves a label twice. With e_d the error of a ground point's disparity, and
-(e_x, e_y) that of its place in the grid of the labelled view, what was at x + e is what the pixel x
-is said to show. So the label at a pixel is off by
+With e_d the error of a ground point's disparity, (e_x, e_y) that of its place in the grid of the
+labelled view, and s the slope of the disparity, the label at a pixel is off by e_d - s_x e_x -
+s_y e_y. These have causes in common, so that their covariance is kept, on nodes over the grid. Why,
+and why errors of the other image's rows have no part: docs/explanation/uncertainty.md.
 
-    e_d - s_x e_x - s_y e_y,
-
-s being the slope of the disparity along x and y. The errors have causes in common: the labelled
-image's correction moves place and disparity alike. Its variance therefore needs the covariance of
-all three, not their standard deviations alone.
-
-The epipolar grids are made from the same corrections. So a ground point whose rows the alignment
-gets wrong in the right image only keeps its left pixel and its disparity: its label is right, and
-the right image shows it in another row. That is y-parallax, an error of the images and not of the
-labels; e_y is that of the labelled view alone.
-
-Strips of the LiDAR that disagree are another error. A point that is off by o = (east, north, up)
-lies off in the grid of the labelled view, and its disparity is off, by e = J o. Images are aligned
-to all strips together, so that labels of a strip are off by e less what the alignment takes of it
-(:func:`_taken`). This is known of each strip; its square is part of the labels' variance, with the
-variance of the offset itself.
+A strip of the LiDAR that is off by o = (east, north, up) moves its labels by J o, less what the
+alignment takes of all strips together (:func:`_taken`).
 """
 
 from __future__ import annotations

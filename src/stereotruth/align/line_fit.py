@@ -1,15 +1,10 @@
 """Corrections by line of both images of a pair, from what an affine leaves at the tie points.
 
-Roll and pitch that swing while an image is taken move its lines. By how much, and how smoothly, the
-tie points themselves say: each image's two functions of the line are Gaussian processes, whose
-standard deviations (along the lines and across) and length are those of the greatest marginal
-likelihood, beside errors of the matches and errors that the places of a site share. They have no
-mean and no trend over the lines, which are the affine's. On level ground tie points see the
-difference of both images alone; what both have in common is seen on slopes, and stays uncertain by
-as much as the process says.
-
-The corrections are used if the likelihood rises by more than chance allows, and if those of one
-half of the sites fit the tie points of the other half better than none.
+Each image's two functions of the line (roll, pitch) are Gaussian processes, whose standard
+deviations and length are those of the greatest marginal likelihood, beside errors of matches and
+sites. They have no mean and no trend over the lines, which are the affine's. They are used if the
+likelihood rises by more than chance allows, and if one half of the sites fits the other better with
+them. See docs/explanation/refinement.md.
 """
 
 from __future__ import annotations

@@ -1,19 +1,11 @@
 """Automatic refinement of an alignment: what is left between LiDAR and the two images is removed.
 
-GCPs of 0.25 px leave 0.1 to 0.25 px of y-parallax and of difference between the disparities of
-LiDAR and images. Hundreds of tie points (:mod:`.tie_points`) see this relative error directly. What
-both images have in common they see on slopes only, as LiDAR strips are co-registered by their
-heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
-both affines are estimated together, the GCP fits and their covariance being the prior: tie points
-settle the relative part, and the rest as far as they see it. Where that leaves the place in plan
-open, edges of roofs settle it (:mod:`.shared_errors`).
-
-The adjustment starts from what most tie points agree on, and blunders (moved or built since,
-vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
-by an amount that is estimated from the scatter between sites. All share one, that is estimated
-from how much good and poor matches differ. The alignment is left exactly as it is if neither tie
-points nor roofs contradict it, or if the corrections from one half of the sites do not improve the
-other half.
+Tie points (:mod:`.tie_points`) see how both images are off against each other and, on slopes,
+against the LiDAR. The twelve parameters of both affines are estimated from them together, with the
+fits to the control points as the prior (:mod:`.adjustment`), corrections by line (:mod:`.line_fit`)
+and the place in plan by edges of roofs (:mod:`.shared_errors`). The alignment is left exactly as it
+is if nothing contradicts it, or if one half of the sites does not improve the other. How, and how
+well: docs/explanation/refinement.md.
 """
 
 from __future__ import annotations

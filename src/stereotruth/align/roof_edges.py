@@ -1,15 +1,10 @@
 """Edges of roofs: where the LiDAR has them, and by how much an image shows them elsewhere.
 
-Such an edge stands in a fixed place over the ground, and an image shows it as a line. Level ground
-tells nothing of its own place; its roofs do. An edge is a straight line between a smooth roof and
-points that lie lower by STEP_M at least, along LENGTH_M. Crowns are no roofs: their points lie on
-no plane.
-
-Across each edge, the slopes of the grey values are looked at, as their median along the edge has
-them. Roofs have parapets, gutters and overhangs, and sunlit walls: an image has several lines
-beside each other, and which of them is the LiDAR's edge is not known. So every line has a say by
-its share of the contrast, and the offset is that at which most of them lie near the edges, within
-ROOF_RIM_M. Opposite edges tell how far points and lines lie inwards or outwards of each other.
+An edge is a straight line between the points of a smooth roof and points that lie lower by STEP_M,
+along LENGTH_M. Across it, an image has several lines (parapets, gutters, sunlit walls), each of
+which has a say by its share of the contrast: the offset is that at which most of them lie near the
+edges, within ROOF_RIM_M. Opposite edges tell how far points and lines lie inwards of each other. See
+docs/explanation/real_sensors.md.
 """
 
 from __future__ import annotations

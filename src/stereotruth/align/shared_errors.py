@@ -1,16 +1,12 @@
 """Errors that tie points share, which their number does not average away.
 
-**Near each other.** Strips of the LiDAR that disagree, RPCs that an affine does not follow,
-attitude beyond what the lines tell: the residuals of sites near each other agree. Their covariance
-is that of the greatest restricted likelihood (Patterson & Thompson 1971), exponential in the
-distance, beside errors that each site has for itself. It counts if the likelihood rises by more
-than chance allows; then it is part of what labels state, and of how sure the corrections are.
+**Near each other.** Their covariance is that of the greatest restricted likelihood (Patterson &
+Thompson 1971), exponential in the distance, beside errors that each site has for itself
+(docs/explanation/uncertainty.md).
 
-**All of them, in plan.** Tie points bind images to each other. Of the place that all have in common
-they tell by slopes only, and what they tell is stated with twice the variance that their scatter
-shows: light and shade change with the slope, and so do errors of matches, in all of a scene alike.
-Edges of roofs enter as observations beside them (:mod:`.roof_edges`). All images look at the same
-roofs, so that they share COMMON_M of error.
+**All of them, in plan.** What tie points tell of the place that all images have in common is stated
+with twice its variance, and edges of roofs (:mod:`.roof_edges`) enter as observations beside them,
+with COMMON_M of error that all images share (docs/explanation/real_sensors.md).
 """
 
 from __future__ import annotations

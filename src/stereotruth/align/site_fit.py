@@ -1,18 +1,12 @@
 """One correction per image: the images of a site that share ground, adjusted together.
 
-Unknown are the affine corrections of all images. Three kinds of observations bear on them: the
-RPCs, which are off by :func:`.alignment.rpc_prior`; control points as measured in each image; and
-the tie points of each pair (:mod:`.refine`), which bind the errors of two images to each other and,
-on slopes, to the LiDAR. A pair enters as its normal equations, whose weights are those of its own
-robust estimate. Images that share no pair are bound through those between them.
-
-Control points that no correction fits get no weight (Tukey's biweight), and so do pairs whose tie
-points contradict those of the other pairs by more than their errors explain. The result does not
-depend on the order of images or pairs.
-
-Each pair tells by itself whether its lines are off (:mod:`.line_fit`). The images of pairs that do
-get one correction by line each, as Gaussian processes whose standard deviations and length are the
-medians of those pairs. An image that jitters shows it in all of its pairs, its partners in one.
+Observations are the RPCs, control points as measured in each image, the normal equations of each
+pair's tie points by its own robust estimate, and edges of roofs. Control points that fit no
+correction, and pairs that contradict the others, lose their weight (Tukey's biweight). The result
+does not depend on the order of images or pairs. The images of pairs whose lines are off
+(:mod:`.line_fit`) get one correction by line each, with the medians of those pairs' processes: an
+image that jitters shows it in all of its pairs, its partners in one. See
+docs/explanation/refinement.md.
 """
 
 from __future__ import annotations

@@ -1,14 +1,11 @@
 """Places where LiDAR and both images show one smooth surface, and by how much they disagree.
 
-The scene is sampled at a fixed number of sites, spread evenly over the ground that both images and
-the LiDAR cover, whatever its size. In a site, places are windows on a plane of the points, whose
-pixels take part if nothing but the plane is seen there (:mod:`.tie_planes`). The plane maps the
-left window to the right image, and robust least-squares matching finds by how much the right image
-shows the same elsewhere (:mod:`.least_squares_matching`): the tie point's shift.
-
-On a plane a right image position depends on the left one by ``carry``, so that the shift is, to
-first order, (error of the right image's model) − carry · (error of the left's): what both have in
-common is seen on slopes only.
+Places are windows on a plane of the points at sites all over the scene, whose pixels take part if
+nothing but the plane is seen there (:mod:`.tie_planes`). The plane maps the left window to the
+right image, and robust least-squares matching (:mod:`.least_squares_matching`) finds the tie point's
+shift. With ``carry``, by which a right position depends on the left one, the shift is to first order
+(error of the right image's model) − carry · (error of the left's). See
+docs/explanation/refinement.md.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Geoids: grids of their heights from GTX or GeoTIFF files, and those that PROJ knows of a place.
 
-Heights without a declared surface may count from any of the geoids of a place. Nothing is chosen
-here: names of grids are those of PROJ's register, which has for each the ground that it is made
-for; a grid is looked at if it is on this machine, and is never fetched.
+Nothing is chosen here: names of grids are those of PROJ's register, which has for each the ground
+that it is made for; a grid is looked at if it is on this machine, and is never fetched.
 """
 
 from __future__ import annotations

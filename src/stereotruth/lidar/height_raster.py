@@ -1,15 +1,10 @@
 """Rasters of heights on the ground: where their cells lie, and what their heights count from.
 
-The one reader of surface models and elevation models, for LiDAR, scores and control points: values
-by :mod:`..core.products.rasters`, systems by :mod:`.declared_crs`, datums by
-:mod:`.to_wgs84`. Pixels that are points (AREA_OR_POINT) are the middles of their cells.
-
-Places are metres on the ground along the raster's columns and against its rows, from the centre of
-the upper-left cell: (x, y) = (column · dx, −row · dy), dx and dy being what a cell measures on the
-ellipsoid in the raster's middle. So any north-up grid serves, in degrees, feet or a projection
-whose metres are none on the ground; :meth:`HeightRaster.to_enu` turns shifts to east and north.
-
-As LiDAR, each cell that has a height becomes a point in its middle, a record of LAS format 6 of
+The one reader of surface and elevation models, for LiDAR, scores and control points. Pixels that
+are points (AREA_OR_POINT) are the middles of their cells. Places are metres on the ground from the
+centre of the upper-left cell, (x, y) = (column · dx, −row · dy), dx and dy being what a cell measures
+on the ellipsoid in the raster's middle: so any north-up grid serves, in degrees, feet or a
+projection. As LiDAR, each cell that has a height becomes a point in its middle, of LAS format 6 and
 class 1 (unclassified), the only return of its pulse.
 """
 

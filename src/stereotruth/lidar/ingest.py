@@ -1,10 +1,9 @@
 """LiDAR files to spatially ordered point stores, and what their headers say without their points.
 
-Every point lies on one global lattice (:mod:`.lattice`). Sums over lattice integers are exact, so
-that nothing later depends on the order of files or points. Points are stored by square cells,
-cells in row-major order (south to north, west to east), inside a cell in the order of the file. The
-store of a file is the same to the byte whatever the size of the reading chunks; of a footprint, it
-is the file's own store without the other cells. Its files: see :mod:`.point_store`.
+Every point lies on one global lattice (:mod:`.lattice`), so that nothing later depends on the order
+of files or points. The store of a file is the same to the byte whatever the size of the reading
+chunks; of a footprint, it is the file's own store without the other cells. Its files: see
+:mod:`.point_store`.
 """
 
 from __future__ import annotations

@@ -1,15 +1,11 @@
 """Octrees of points (COPC, EPT) of which a footprint is read, with checks that none is missing.
 
-An octree keeps its points in nodes: cubes of half the side of their parent's. Which nodes may hold
-points of a footprint follows from the octree's own cube, never from the header's bounds, which
-writers get wrong. Before any point is read, the counts of all nodes of the hierarchy must add up to
-the header's count. While points are read, each node must hold as many as the hierarchy says, all of
-them within the node's cube: else other nodes may hold points of the footprint too.
-
-COPC is a LAZ file whose chunks are the nodes: its chunk table and its hierarchy tell the same by
-different ways. laspy's own reader is not asked, as its answer is cut by a box, and cannot tell
-whether a node keeps to its cube. Of Entwine Point Tiles, each node is a LAZ file of its own.
-Sources: COPC 1.0 (Hobu); Entwine Point Tile 1.0 (entwine.io).
+Which nodes (cubes of half the side of their parent's) may hold points of a footprint follows from
+the octree's own cube, never from the header's bounds. The counts of all nodes must add up to the
+header's, and each node that is read must hold as many points, all within its cube. laspy's reader
+of COPC is not asked, as its answer is cut by a box, and cannot tell whether a node keeps to its
+cube. See docs/how-to/national_lidar.md. Sources: COPC 1.0 (Hobu), a LAZ file whose chunks are the
+nodes; Entwine Point Tile 1.0 (entwine.io), where each node is a LAZ file.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
 """What the records of points tell beside their places, counted and coded as they are read.
 
-Days. LAS files have either seconds of a GPS week, which tell no day, or adjusted standard GPS time:
-seconds since 1980-01-06 less 10⁹ (LAS 1.4 R16, "Global Encoding", bit 0), or less another offset
-that the header of LAS 1.5 names (bit 6). Days are counted from 1970-01-01; 0 stands for none. A
-point store has a code of 8 bits for the day of each point, 1 + day modulo :data:`DAY_CODES`.
+Days. GPS times are seconds of a week, which tell no day, or seconds since 1980-01-06 less 10⁹ (LAS
+1.4 R16, "Global Encoding", bit 0), or less another offset of the header of LAS 1.5 (bit 6). Days
+count from 1970-01-01; 0 stands for none. A store has a code of 8 bits for the day of each point, 1
++ day modulo :data:`DAY_CODES`.
 
-Strips of a flight are told by ``point_source_id``, else by GPS times, where no point was measured
-for a while, else by flags of the edge of a flight line: two edges that follow each other are a line
-of pulses apart within a strip, and far apart between strips. Codes follow from a point alone, so
-that a point has the same in any part of a file that is read: the ``point_source_id`` itself, or the
-time in steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`). Only the
-strips of edge flags are numbered within their file. See docs/explanation/real_sensors.md.
+Strips of a flight (docs/explanation/real_sensors.md). Codes follow from a point alone, so that a
+point has the same in any part of a file that is read: the ``point_source_id`` itself, or the time in
+steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`). Only the strips of
+edge flags, two of which follow each other far apart between strips, are numbered in their file.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """Smooth maps of three coordinates as polynomials, one for each patch of a lattice.
 
-Patches follow from the lattice alone and a polynomial from its patch alone, so that a point comes
-out the same in any file, chunk or window. A patch is fitted to the exact map at its nodes, by sums
-in a fixed order, and checked at other points up to its corners; where one that misses its tolerance
-is needed, the exact map itself is asked. :class:`PatchedTransform` undoes map projections, in some
-6 ns a point instead of PROJ's 130 to 900; :class:`LocalProjection` takes the ground to epipolar
-pixels, in a tenth of the model's time.
+A patch follows from the lattice and a polynomial from its patch alone, so that a point comes out
+the same in any file, chunk or window. It is fitted to the exact map at its nodes and checked at
+others up to its corners; where it misses its tolerance the exact map itself is asked.
+:class:`PatchedTransform` undoes map projections, in 6 ns a point instead of PROJ's 130 to 900;
+:class:`LocalProjection` takes the ground to epipolar pixels, in a tenth of the model's time.
 """
 
 from __future__ import annotations

@@ -1,14 +1,9 @@
 """Strips of a site's LiDAR compared where they overlap: what each is off from the others.
 
-A cell of the point stores is divided into squares. Where the single returns of a strip in a square
-lie on a plane, the plane is taken; where two strips have one, the planes differ by
-
-    d = dz - g · (dx, dy),
-
-with (dx, dy, dz) the offset of the second strip from the first and g the slope of the ground or
-roof (ASPRS, "Guidelines on Geometric Inter-Swath Accuracy and Quality of Lidar Data", 2018; Latypov
-2002). One adjustment of all pairs of the site gives each strip's offset from the one with most
-ground. Points are read once, cell by cell.
+Where two strips have a plane of single returns in a square, these differ by d = dz - g · (dx, dy),
+with the offset (dx, dy, dz) of the second strip and the slope g (ASPRS, "Guidelines on Geometric
+Inter-Swath Accuracy and Quality of Lidar Data", 2018; Latypov 2002). One adjustment of all pairs
+gives each strip's offset from the one with most ground. See docs/explanation/real_sensors.md.
 """
 
 from __future__ import annotations

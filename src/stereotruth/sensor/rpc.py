@@ -4,11 +4,9 @@ Image coordinates are (col, row) = (sample, line) with (0, 0) at the centre of t
 ground coordinates are WGS 84 longitude, latitude in degrees and ellipsoidal height in metres.
 RPC00B and the order of its 20 terms: NGA STDI-0002, Appendix E.
 
-Every line of a pushbroom image is taken at its own time, with its own roll and pitch. The
-correction by line moves a whole line along its columns and across them, for an attitude that
-jitters, which no RPC follows. It is no part of the kernels: they know the smooth sensor, and the
-correction is added where a position in the image itself is asked for. So all polynomials of the
-smooth sensor stay as exact as they are.
+The correction by line moves a whole line along its columns and across them, for an attitude that
+jitters. The kernels know the smooth sensor alone; the correction is added where a position in the
+image itself is asked for, so that all polynomials of the smooth sensor stay exact.
 """
 
 from __future__ import annotations

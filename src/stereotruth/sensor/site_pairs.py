@@ -1,18 +1,13 @@
 """Pairs of images: what they share, under which light, how they rank, which images they link.
 
 All follows from RPCs and times alone, before anything is matched. The angles are those by which
-pairs are chosen in the field: convergence, elevation of the bisector and asymmetry of both rays
-(Jeong and Kim 2014, ISPRS J. 92; Ames Stereo Pipeline, asp_plot), and the difference of the sun's
-direction, which decides most for pairs of two dates (Qin 2019, ISPRS J. 147). Images count as
-diachronic where the shadow of an ordinary building ends elsewhere in them, or where a season lies
-between them (docs/explanation/real_sensors.md).
+pairs are chosen in the field (Jeong and Kim 2014, ISPRS J. 92; Ames Stereo Pipeline, asp_plot; Qin
+2019, ISPRS J. 147); what counts as diachronic: docs/explanation/real_sensors.md.
 
 Pairs rank by the information about heights that a pixel is expected to give: the share of pixels
 that can be matched, times ½ log₂(1 + (RELIEF_M / height_sigma_m)²) bits (Shannon 1949). The log
-odds of a match fall with the base over the height, with the way of the shadows and with the
-roughness of the site (:func:`stereotruth.lidar.point_statistics.roughness_m`), as far as its LiDAR
-has been read. The coefficients are fitted and tested on other sites by ``bench/pairs.py``
-(docs/stack.md).
+odds of a match fall with the base, the way of the shadows and the roughness of the site, by
+coefficients that ``bench/pairs.py`` fits and tests (docs/stack.md).
 """
 
 from __future__ import annotations
