@@ -3,8 +3,8 @@
 An edge is a straight line between the points of a smooth roof and points that lie lower by STEP_M,
 along LENGTH_M. Across it, an image has several lines (parapets, gutters, sunlit walls), each of
 which has a say by its share of the contrast: the offset is that at which most of them lie near the
-edges, within ROOF_RIM_M. Opposite edges tell how far points and lines lie inwards of each other. See
-docs/explanation/real_sensors.md.
+edges, within ROOF_RIM_M. Opposite edges tell how far points and lines lie inwards of each other.
+See docs/explanation/real_sensors.md.
 """
 
 from __future__ import annotations

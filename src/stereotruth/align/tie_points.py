@@ -2,10 +2,9 @@
 
 Places are windows on a plane of the points at sites all over the scene, whose pixels take part if
 nothing but the plane is seen there (:mod:`.tie_planes`). The plane maps the left window to the
-right image, and robust least-squares matching (:mod:`.least_squares_matching`) finds the tie point's
-shift. With ``carry``, by which a right position depends on the left one, the shift is to first order
-(error of the right image's model) − carry · (error of the left's). See
-docs/explanation/refinement.md.
+right image, and least-squares matching (:mod:`.least_squares_matching`) finds the shift that is
+left: with ``carry``, by which a right position depends on the left one, to first order (error of
+the right image's model) − carry · (error of the left's). See docs/explanation/refinement.md.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The one reader of surface and elevation models, for LiDAR, scores and control points. Pixels that
 are points (AREA_OR_POINT) are the middles of their cells. Places are metres on the ground from the
-centre of the upper-left cell, (x, y) = (column · dx, −row · dy), dx and dy being what a cell measures
-on the ellipsoid in the raster's middle: so any north-up grid serves, in degrees, feet or a
+centre of the upper-left cell, (x, y) = (column · dx, −row · dy), by what a cell measures on the
+ellipsoid in the raster's middle: so any north-up grid serves, in degrees, feet or a
 projection. As LiDAR, each cell that has a height becomes a point in its middle, of LAS format 6 and
 class 1 (unclassified), the only return of its pulse.
 """

@@ -6,8 +6,8 @@ count from 1970-01-01; 0 stands for none. A store has a code of 8 bits for the d
 + day modulo :data:`DAY_CODES`.
 
 Strips of a flight (docs/explanation/real_sensors.md). Codes follow from a point alone, so that a
-point has the same in any part of a file that is read: the ``point_source_id`` itself, or the time in
-steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`). Only the strips of
+point has the same in any part of a file that is read: the ``point_source_id`` itself, or the time
+in steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`). Only the strips of
 edge flags, two of which follow each other far apart between strips, are numbered in their file.
 """
 
