@@ -105,16 +105,6 @@ def _heights_around(stores: Sequence[PointStore], gcp: GcpResidual, reach_m: flo
     return height[distance <= max(reach_m, np.partition(distance, AROUND - 1)[AROUND - 1])]
 
 
-def pixel_m(alignment: Alignment) -> float:
-    """Size of a pixel of the left image on the ground, m."""
-    cols, rows = alignment.left_fit.size
-    ends = [
-        np.array(alignment.left.localize(cols / 2 + step, rows / 2, alignment.reference_height))
-        for step in (-0.5, 0.5)
-    ]
-    return float(np.hypot(*(ends[1] - ends[0]) * metres_per_degree(ends[0][1])))
-
-
 def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float) -> str:
     """A sentence if most control points lie on no point of the LiDAR, else nothing.
 

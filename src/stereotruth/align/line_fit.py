@@ -304,12 +304,6 @@ def posterior_covariance(normal: Floats, variances: Floats) -> Floats:
     return root[:, None] * np.linalg.inv(inner) * root
 
 
-def _freedom(covariance: Floats, variances: Floats) -> float:
-    """How many unknowns [p] a prior of ``variances`` leaves, by their posterior covariance."""
-    known = variances > 0.0
-    return float(known.sum() - np.sum(np.diag(covariance)[known] / variances[known]))
-
-
 def fit_lines(
     equations: Equations,
     affine_root: Floats,
@@ -352,11 +346,13 @@ def fit_lines(
     # Of the lines where the affines are known, whose own uncertainty is that of the estimate: what
     # both share is known better than either.
     beside = posterior_covariance(sums.sharing(amount(steps[2]))[0][own, own], variances[own])
+    known = variances[own] > 0.0
+    freedom = known.sum() - np.sum(np.diag(beside)[known] / variances[own][known])
     noise = float(np.sqrt(found.noise))
     return LineFit(
         np.round(lines, 6).ravel(),  # so that the count of threads leaves no trace
         affine_root @ found.mean[:affine],
-        _freedom(beside, variances[own]),
+        float(freedom),
         rows,
         covariance_at_lines(
             beside * found.noise * unit**2 * halves.spread, root, equations.lines, rows

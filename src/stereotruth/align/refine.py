@@ -21,10 +21,12 @@ import numpy as np
 from ..core.config.configuration import Rectify
 from ..core.errors import InputError
 from ..core.numerics.arrays import Floats
+from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.statistics import robust_sigma
 from ..core.products.files import write_table
 from ..lidar.point_store import PointStore, open_stores
 from ..sensor.images import Source, open_pair
+from ..sensor.pair_geometry import pixel_deg
 from .adjustment import (
     LEAST_SIGMA,
     Estimate,
@@ -48,7 +50,6 @@ from .doubts import (
     height_by_images,
     height_by_rpcs,
     heights_of_model,
-    pixel_m,
     remark_of,
     scatter_by_heights,
 )
@@ -349,10 +350,9 @@ def refine(
         prior = prior_of(alignment)
         gcps = control_points_of(alignment)
         sensors = alignment.left, alignment.right
-        doubts = [
-            doubt_at_gcps(gcps, stores, pixel_m(alignment)) if gcps else "",
-            doubt_by_rpcs(stores, sensors),
-        ]
+        middle = [n / 2 for n in alignment.left_fit.size]
+        pixel = pixel_deg(alignment.left, *middle, alignment.reference_height)[1] * DEGREE_M
+        doubts = [doubt_at_gcps(gcps, stores, pixel), doubt_by_rpcs(stores, sensors)]
         doubts = [text for text in doubts if text]
         alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)

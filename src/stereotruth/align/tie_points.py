@@ -79,10 +79,6 @@ def _smaller_eigenvalue(xx: Floats, xy: Floats, yy: Floats) -> Floats:
     return (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
 
 
-def _window_sums(values: Floats) -> Floats:
-    return cv2.boxFilter(values, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
-
-
 def _candidates(
     information: tuple[Floats, Floats, Floats], share: Floats, at: Ints
 ) -> tuple[Ints, Ints]:
@@ -92,10 +88,9 @@ def _candidates(
     By the information of their pixels, and by the share of the points that lie on the plane.
     ``share`` [k, k] of the candidates at px ``at`` [k] along both axes, 0 where there is no plane.
     """
-    score = np.maximum(
-        _smaller_eigenvalue(*(_window_sums(np.nan_to_num(t)) for t in information)), 0.0
-    )
-    score = score[np.ix_(at, at)] * share**4
+    how = {"normalize": False, "borderType": cv2.BORDER_CONSTANT}
+    sums = (cv2.boxFilter(np.nan_to_num(t), -1, (SIDE, SIDE), **how) for t in information)
+    score = np.maximum(_smaller_eigenvalue(*sums), 0.0)[np.ix_(at, at)] * share**4
     parts, found = [], []
     edges = np.linspace(0, len(at), PER_SIDE + 1).astype(int)
     for top, bottom in pairwise(edges):
@@ -161,25 +156,15 @@ def _places_of(points: SitePoints, picture: Singles) -> list[tuple[Ints, Floats,
     found = []
     for clear in points.clear_pixels(centres + MARGIN, planes):
         clear &= np.isfinite(own[0])
-        score = np.where(clear.sum(axis=(1, 2)) >= MIN_CLEAR, _information_of(own, clear), 0.0)
-        best = _best_of_parts(part, score)
+        sums = (np.where(clear, values, 0.0).sum(axis=(1, 2)) for values in own)
+        score = np.where(clear.sum(axis=(1, 2)) >= MIN_CLEAR, _smaller_eigenvalue(*sums), 0.0)
+        best_of: dict[int, int] = {}  # by part
+        for k in np.flatnonzero(score >= MIN_INFORMATION).tolist():
+            if score[k] > score[best_of.setdefault(int(part[k]), k)]:
+                best_of[int(part[k])] = k
+        best = list(best_of.values())
         found.append((centres[best], planes[best, :3], clear[best]))
     return found
-
-
-def _information_of(own: Sequence[Floats], pixels: Bools) -> Floats:
-    """Smaller eigenvalue [k] of the information xx, xy, yy [k, SIDE, SIDE] of some ``pixels`` of
-    windows."""
-    return _smaller_eigenvalue(*(np.where(pixels, values, 0.0).sum(axis=(1, 2)) for values in own))
-
-
-def _best_of_parts(part: Ints, score: Floats) -> list[int]:
-    """The candidate of each ``part`` [k] that has the greatest ``score`` [k], if that is enough."""
-    best: dict[int, int] = {}
-    for k in np.flatnonzero(score >= MIN_INFORMATION).tolist():
-        if score[k] > score[best.setdefault(int(part[k]), k)]:
-            best[int(part[k])] = k
-    return list(best.values())
 
 
 def find_places(

@@ -22,7 +22,7 @@ import numpy as np
 from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import DEGREE_M
 from .deliveries import Acquisition, between_suns, shadow_shift
-from .pair_geometry import frame, inside, ray_upwards, view_order
+from .pair_geometry import frame, inside, pixel_deg, ray_upwards, view_order
 from .rpc import SensorModel
 
 Names = tuple[str, str]  # of a pair's images
@@ -142,7 +142,7 @@ def pair_of(one: SiteImage, other: SiteImage, height: float) -> SitePair | None:
     places = (one.sensor, col, row), (other.sensor, *there)
     rays = tuple(ray_upwards(*place, height) for place in places)
     left, right = order(one, other, overlap, rays, height)
-    pixels = [_pixel_m(*place, height) for place in places]
+    pixels = [pixel_deg(*place, height)[1] * DEGREE_M for place in places]
     areas = [image.size[0] * image.size[1] * pixel**2 for image, pixel in zip((one, other), pixels)]
     ground = float(seen.mean()) * areas[0]
     convergence, bisector, asymmetry = angles_of(rays)
@@ -167,15 +167,6 @@ def pair_of(one: SiteImage, other: SiteImage, height: float) -> SitePair | None:
 def _days(one: datetime | None, other: datetime | None) -> float | None:
     """Between two times; None if one is not known."""
     return None if one is None or other is None else abs((one - other) / timedelta(days=1))
-
-
-def _pixel_m(sensor: SensorModel, col: float, row: float, height: float) -> float:
-    """Side of the square that has the area of a pixel on level ground, m."""
-    lon, lat = sensor.localize([col - 5, col + 5, col, col], [row, row, row - 5, row + 5], height)
-    east = DEGREE_M * math.cos(math.radians(lat[0]))
-    across = (lon[1] - lon[0]) * east, (lat[1] - lat[0]) * DEGREE_M
-    along = (lon[3] - lon[2]) * east, (lat[3] - lat[2]) * DEGREE_M
-    return math.sqrt(abs(across[0] * along[1] - across[1] * along[0])) / 10.0
 
 
 def order(
