@@ -62,14 +62,9 @@ class ControlPoints:
     remarks: tuple[str, ...] = ()
 
     @property
-    def in_left(self) -> Bools:
-        """bool[n]: measured in the left image."""
-        return np.isfinite(self.left[:, 0])
-
-    @property
-    def in_right(self) -> Bools:
-        """bool[n]: measured in the right image."""
-        return np.isfinite(self.right[:, 0])
+    def seen(self) -> tuple[Bools, Bools]:
+        """bool[n] each: measured in the left, in the right image."""
+        return np.isfinite(self.left[:, 0]), np.isfinite(self.right[:, 0])
 
 
 def read_gcps(

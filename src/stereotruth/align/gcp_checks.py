@@ -274,9 +274,8 @@ def check_ground(points: ControlPoints, boxes: Sequence[Floats], images: Sequenc
     """
     inside = [_in_box(box, points.lon, points.lat) for box in boxes]
     near = np.any(inside, axis=0)
-    measured = points.in_left, points.in_right
     shares = [
-        float(np.mean(here[seen])) if seen.any() else 1.0 for here, seen in zip(inside, measured)
+        float(np.mean(here[seen])) if seen.any() else 1.0 for here, seen in zip(inside, points.seen)
     ]
     if min(shares) == 0.0 and max(shares) > 0.5:
         wrong = int(np.argmin(shares))
@@ -329,7 +328,7 @@ def misfits_of_sides(
     Median distance from the median shift, the worse of both images; NaN of fewer than three GCPs
     (``near`` [n], default all) that both images show.
     """
-    both = points.in_left & points.in_right
+    both = np.logical_and(*points.seen)
     both = both if near is None else both & near
     if both.sum() < 3:
         return np.nan, np.nan

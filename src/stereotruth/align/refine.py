@@ -56,7 +56,7 @@ from .doubts import (
 from .images import choose_sites
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
-from .records import Equations, spread_of
+from .records import Equations, spreads_of
 from .shared_errors import SharedErrors, place_pair, with_shared_errors
 from .tie_points import Geometry, common_shift, find_places, match
 
@@ -100,14 +100,7 @@ def _record(
     """JSON-ready figures of a refinement; ``reason`` why it was not applied, or empty."""
     observations, found, refined = result.observations, result.estimate, result.alignment
     used, ties = observations.used, observations.ties
-    size = alignment.left_fit.size
-    spreads = {
-        word: {
-            name: spread_of(values[used, k], ties.left[used], size)
-            for k, name in enumerate(("disparity", "y_parallax"))
-        }
-        for word, values in (("before", observations.before), ("after", observations.after))
-    }
+    states = observations.before[used], observations.after[used]
     return {
         "applied": not reason,
         "reason": reason,
@@ -120,7 +113,7 @@ def _record(
         "deviation_over_that_of_the_match": found.ratio.round(3).tolist(),
         "shared_in_a_site": found.site_ratio.round(3).tolist(),
         "sigma_shared_by_all_px": found.shared.round(4).tolist(),
-        **spreads,
+        **spreads_of(*states, ties.left[used], alignment.left_fit.size),
         "change_of_left": _changes(alignment.left_fit, refined.left_fit.affine),
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "

@@ -33,7 +33,7 @@ def test_files_of_spreadsheets_are_read(tmp_path):
     assert points.lon.tolist() == [115.3, 115.1]
     assert points.height.tolist() == [70.0, 50.0]
     assert points.left[1].tolist() == [1.5, 2.5]
-    assert points.in_left.tolist() == [False, True]
+    assert points.seen[0].tolist() == [False, True]
     assert points.in_right.tolist() == [True, False]
 
 
