@@ -203,13 +203,23 @@ def pair_outlines(left: SensorModel, right: SensorModel, sizes: Sizes) -> list[F
 
     Raises InputError if the images share no ground.
     """
-    low, high = _heights(left, right)
+    boxes = np.array([sensor.rpc.ground_box[4:] for sensor in (left, right)])
+    low, high = float(boxes[:, 0].min()), float(boxes[:, 1].max())
+    margin = HEIGHT_SHARE * (high - low)
+    low, high = low - margin, high + margin
     middle = (low + high) / 2
     overlap = find_overlap(left, right, sizes, middle, (low, high), ("left", "right"))
     turn = find_rotation(left, right, overlap, middle)[0][:, :2]
-    heights = steps(low, high, LEVELS, 0.0)
     wide = DEVIATIONS * (RPC_SHIFT + RPC_TILT * max(*sizes[0], *sizes[1]))
-    col, row = turn.T @ _rim(*_grid(left, right, sizes, turn, heights, wide))
+    # The pair's grid, in turned px of the left image: what its frame shares with the right one at
+    # any of the heights, as in :func:`.fit._grid`, wider by what the RPCs may be off.
+    heights = steps(low, high, LEVELS, 0.0)[None, :]
+    lon, lat = right.localize(*(axis[:, None] for axis in frame(sizes[1], EDGE)), heights)
+    seen = np.stack(left.project(lon, lat, heights)).reshape(2, -1)
+    frames = turn @ np.stack(frame(sizes[0], 2)), turn @ seen[:, np.isfinite(seen).all(axis=0)]
+    first = np.maximum(*(each.min(axis=1) for each in frames)) - wide
+    last = np.minimum(*(each.max(axis=1) for each in frames)) + wide
+    col, row = turn.T @ _rim(first, last)
     grid = []
     for height, other in ((low, high), (high, low)):
         lon, lat = left.localize(col, row, height)
@@ -219,36 +229,6 @@ def pair_outlines(left: SensorModel, right: SensorModel, sizes: Sizes) -> list[F
         rim = _rim(np.full(2, -wide), np.array(size) - 1 + wide)
         outlines.append(_hull([sensor.localize(*rim, height) for height in (low, high)]))
     return outlines
-
-
-def _heights(left: SensorModel, right: SensorModel) -> tuple[float, float]:
-    """Ellipsoidal heights (m) between which the ground of a pair lies."""
-    boxes = np.array([sensor.rpc.ground_box[4:] for sensor in (left, right)])
-    low, high = float(boxes[:, 0].min()), float(boxes[:, 1].max())
-    margin = HEIGHT_SHARE * (high - low)
-    return low - margin, high + margin
-
-
-def _grid(
-    left: SensorModel,
-    right: SensorModel,
-    sizes: Sizes,
-    turn: Floats,
-    heights: Floats,
-    wide: float,
-) -> tuple[Floats, Floats]:
-    """Lowest and highest corner [2] of the pair's epipolar grid, in turned px of the left image.
-
-    What the left frame shares with the right one at any of the heights, as in :func:`.fit._grid`,
-    widened by ``wide`` px for what the RPCs may be off.
-    """
-    col, row = frame(sizes[1], EDGE)
-    lon, lat = right.localize(col[:, None], row[:, None], heights[None, :])
-    seen = np.stack(left.project(lon, lat, heights[None, :])).reshape(2, -1)
-    frames = turn @ np.stack(frame(sizes[0], 2)), turn @ seen[:, np.isfinite(seen).all(axis=0)]
-    low = np.maximum(*(each.min(axis=1) for each in frames)) - wide
-    high = np.minimum(*(each.max(axis=1) for each in frames)) + wide
-    return low, high
 
 
 def _rim(low: Floats, high: Floats) -> Floats:

@@ -245,12 +245,6 @@ def _window(source: Source, at: Floats, reach: float) -> tuple[Singles, Floats] 
     return source.read(*low.tolist(), *(high - low).tolist()), low
 
 
-def _widening(carry: Floats) -> tuple[float, float]:
-    """Widening of the kernel along (col, row) where the right image is the finer one."""
-    spans = np.hypot(carry[:, 0], carry[:, 1])
-    return tuple(float(span) if span > ANTIALIAS else 1.0 for span in spans)
-
-
 @dataclass(frozen=True, eq=False)
 class _Windows:
     """One place, ready for matching: see :func:`_prepared`."""
@@ -343,8 +337,10 @@ def _prepared(
             clear = (places.clear[k] & (holes[1:-1, 1:-1] == 0)).astype(np.float32)
             if clear.sum() < MIN_CLEAR:
                 continue
-            carry, scale = geometry.carry[k], _widening(geometry.carry[k])
-            at = geometry.right[k] - origin
+            carry, at = geometry.carry[k], geometry.right[k] - origin
+            # of the kernel along (col, row), where the right image is the finer one
+            spans = np.hypot(carry[:, 0], carry[:, 1]).tolist()
+            scale = tuple(span if span > ANTIALIAS else 1.0 for span in spans)
             warp_patch(pixels, *at, carry, scale, big)
             if np.isfinite(big).mean() < 0.5:
                 continue

@@ -36,11 +36,6 @@ def cell_key(row: np.ndarray, col: np.ndarray) -> np.ndarray:
     return (np.asarray(row, np.int64) << 32) + (np.asarray(col, np.int64) + (1 << 30))
 
 
-def cell_m2(row: np.ndarray) -> Floats:
-    """Ground of a cell of each of the rows, m²."""
-    return (CELL_DEG * DEGREE_M) ** 2 * np.cos(np.radians((row + 0.5) * CELL_DEG))
-
-
 def lattice_box(
     lon_min: float, lat_min: float, lon_max: float, lat_max: float
 ) -> tuple[int, int, int, int]:
@@ -111,8 +106,9 @@ class Footprint:
 
     @property
     def cell_m2(self) -> Floats:
-        """Ground of a cell of each row."""
-        return cell_m2(self.row + np.arange(self.held.shape[0]))
+        """Ground of a cell of each row, m²."""
+        row = self.row + np.arange(self.held.shape[0])
+        return (CELL_DEG * DEGREE_M) ** 2 * np.cos(np.radians((row + 0.5) * CELL_DEG))
 
     @cached_property
     def _sums(self) -> Ints:
