@@ -42,15 +42,10 @@ def label_covariance(
     left or right. For points at the reference height; NaN where the model has no ground.
     """
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-    height = model.reference_height
-    if view == "left":
-        left = np.stack(model.epipolar_to_left(x, y), axis=-1)
-        ground = model.left.localize(left[..., 0], left[..., 1], height)
-        right = np.stack(model.right.project(*ground, height), axis=-1)
-    else:
-        right = np.stack(model.epipolar_to_right(x, y), axis=-1)
-        ground = model.right.localize(right[..., 0], right[..., 1], height)
-        left = np.stack(model.left.project(*ground, height), axis=-1)
+    place, ground = _ground(model, x, y, view)
+    other = model.right if view == "left" else model.left
+    there = np.stack(other.project(*ground, model.reference_height), axis=-1)
+    left, right = (place, there) if view == "left" else (there, place)
     slopes = [
         image.slopes(at[..., 0], at[..., 1])
         for image, at in zip((model.left_image, model.right_image), (left, right))
@@ -204,7 +199,7 @@ def with_strips(
         return uncertainty
     rows, cols = (STEP * np.arange(-(-(n - 1) // STEP) + 1) for n in model.shape)
     x, y = (a.astype(np.float64) for a in np.meshgrid(cols, rows))
-    ground = _ground(model, x, y, view)
+    ground = _ground(model, x, y, view)[1]
     shares = _shares(strips, *ground)
     known = shares.sum(axis=0) > 0
     if not known.any():
@@ -239,12 +234,15 @@ def _taken(effects: Floats, x: Floats, y: Floats, known: Bools) -> Floats:
     return taken
 
 
-def _ground(model: EpipolarModel, x: Floats, y: Floats, view: str) -> tuple[Floats, Floats]:
-    """Longitude and latitude (degrees) of places of a view's grid, at the reference height."""
-    height = model.reference_height
-    if view == "left":
-        return model.left.localize(*model.epipolar_to_left(x, y), height)
-    return model.right.localize(*model.epipolar_to_right(x, y), height)
+def _ground(
+    model: EpipolarModel, x: Floats, y: Floats, view: str
+) -> tuple[Floats, tuple[Floats, Floats]]:
+    """Where the image has places of a view's grid [..., 2] px; longitude and latitude (degrees) of
+    the ground there, at the reference height."""
+    is_left = view == "left"
+    place = model.epipolar_to_left(x, y) if is_left else model.epipolar_to_right(x, y)
+    sensor = model.left if is_left else model.right
+    return np.stack(place, axis=-1), sensor.localize(*place, model.reference_height)
 
 
 def _shares(strips: StripOffsets, lon: Floats, lat: Floats) -> Floats:

@@ -284,14 +284,6 @@ class _Parts(io.RawIOBase):
             raise FileNotFoundError(path)
         return self
 
-    def readable(self) -> bool:
-        """It is."""
-        return True
-
-    def seekable(self) -> bool:
-        """It is."""
-        return True
-
     def tell(self) -> int:
         """The place of the next byte."""
         return self._stream.tell()

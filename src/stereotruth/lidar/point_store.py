@@ -393,15 +393,10 @@ def _datum_name(wkt: str) -> str:
 
 
 def query_points(
-    stores: Sequence[PointStore | str | Path],
-    lon_min: float,
-    lat_min: float,
-    lon_max: float,
-    lat_max: float,
+    stores: Sequence[PointStore], lon_min: float, lat_min: float, lon_max: float, lat_max: float
 ) -> Points:
     """Points of a box (degrees, inclusive) in all stores, store after store."""
-    opened = [s if isinstance(s, PointStore) else PointStore(s) for s in stores]
     box = (lon_min, lat_min, lon_max, lat_max)
     return Points.concatenate(
-        [store.query(*box) for store in opened if not apart(store.bounds[:4], box)]
+        [store.query(*box) for store in stores if not apart(store.bounds[:4], box)]
     )
