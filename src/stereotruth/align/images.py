@@ -9,8 +9,6 @@ what its frame shows.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -147,35 +145,21 @@ def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
     return ""
 
 
-@dataclass(frozen=True)
-class GivenImage:
-    """What the images sheet says: ``acquired`` and ``sun`` (azimuth, elevation) may be None."""
-
-    name: str
-    file: Path
-    acquired: date | datetime | None
-    sun: tuple[float, float] | None
-
-    @classmethod
-    def of(
-        cls, name: str, file: Path, acquired: str, azimuth: float | None, elevation: float | None
-    ) -> GivenImage:
-        """From the cells of a row, which have been checked."""
-        sun = None if azimuth is None or elevation is None else (float(azimuth), float(elevation))
-        return cls(name, file, acquisition_time(acquired) if acquired else None, sun)
-
-
-def open_image(given: GivenImage) -> tuple[SiteImage, Acquisition]:
+def open_image(
+    name: str, file: Path, acquired: str, azimuth: float | None, elevation: float | None
+) -> tuple[SiteImage, Acquisition]:
     """An image and what its delivery says of it. InputError if it or its RPC cannot be used.
 
-    What the sheet says goes before the delivery.
+    What the images sheet says goes before the delivery: the checked cells of the day or time
+    (empty: nothing) and of the sun's angles, degrees.
     """
-    sensor, size = open_view(f"site's {given.name}", given.file, "")
-    rpc = sensor.rpc
-    place = float(rpc.long_off), float(rpc.lat_off)
-    delivery = read_acquisition(given.file, place)
-    taken = by_sheet(delivery, given.acquired, given.sun, place)
-    return SiteImage(given.name, sensor, size, taken.time, taken.sun), delivery
+    sensor, size = open_view(f"site's {name}", file, "")
+    place = float(sensor.rpc.long_off), float(sensor.rpc.lat_off)
+    delivery = read_acquisition(file, place)
+    time = acquisition_time(acquired) if acquired else None
+    sun = None if azimuth is None or elevation is None else (float(azimuth), float(elevation))
+    taken = by_sheet(delivery, time, sun, place)
+    return SiteImage(name, sensor, size, taken.time, taken.sun), delivery
 
 
 def footprint_of(
