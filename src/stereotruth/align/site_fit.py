@@ -225,9 +225,9 @@ class SiteFit:
     scatter: float
     by_line: Mapping[str, LineCorrection]
 
-    def covariance_of(self, name: str) -> Floats:
-        """[6, 6] px² of the parameters of an image."""
-        index = _six(self.names.index(name))
+    def covariance_of(self, *names: str) -> Floats:
+        """[6 k, 6 k] px² of the parameters of some images."""
+        index = np.concatenate([_six(self.names.index(name)) for name in names])
         return self.covariance[np.ix_(index, index)]
 
 
