@@ -42,7 +42,7 @@ def stores(
 ) -> list[PointStore]:
     """Point stores of the strips, cut into a southern and a northern file unless it is one.
 
-    ``told``: what tells the strips: source, time (of the week), or nothing.
+    ``told``: what tells the strips: source, time (of the week), edges, or nothing.
     """
     folder.mkdir(exist_ok=True)
     every = [strip(k, offset) for k, offset in enumerate(offsets)]
@@ -52,6 +52,7 @@ def stores(
     fields = {
         "source": {"point_source_id": 7320 + which},
         "time": {"gps_time": 300_000.0 + 200.0 * which + points[:, 1] / 60.0},
+        "edges": {"edge_of_flight_line": _edges(points, which)},
         "nothing": {},
     }[told]
     made = []
@@ -60,8 +61,8 @@ def stores(
         write_las(
             folder / f"{name}.las",
             xyz=points[of] + [WEST, SOUTH, 0.0],
-            pdrf=6,
-            version="1.4",
+            pdrf=0 if told == "edges" else 6,
+            version="1.2" if told == "edges" else "1.4",
             return_number=single[of],
             number_of_returns=single[of],
             **{field: values[of] for field, values in fields.items()},
@@ -71,3 +72,9 @@ def stores(
         if not halves:
             break
     return made
+
+
+def _edges(points: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """1 for the first and last point of each line of pulses."""
+    first = np.append(True, (np.diff(points[:, 0]) < -WIDTH / 2) | (np.diff(which) != 0))
+    return (first | np.append(first[1:], True)).astype(np.uint8)

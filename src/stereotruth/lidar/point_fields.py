@@ -7,7 +7,8 @@ count from 1970-01-01; 0 stands for none. A store has a code of 8 bits for the d
 
 Strips of a flight (docs/explanation/real_sensors.md). Codes follow from a point alone, so that a
 point has the same in any part of a file that is read: the ``point_source_id`` itself, or the time
-in steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`).
+in steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`). Only the strips of
+edge flags, two of which follow each other far apart between strips, are numbered in their file.
 """
 
 from __future__ import annotations
@@ -42,7 +43,10 @@ BY_CATALOGUE = "catalogue"
 
 STRIP_CODES = 1 << 16  # a code has 16 bits; 0 of time: none
 BIN_S = 10.0  # steps of a week have codes of their own; no aircraft turns in less
-SOURCE, TIME = "point_source_id", "GPS time"
+SOURCE, TIME, EDGES = "point_source_id", "GPS time", "edge of flight line"
+MOST_BY_EDGES = 255  # strips of a file: with more, its points do not stand in the order of flight
+LEAST_EDGES = 5  # of a strip, before a jump can be told from the steps between them
+LOG_JUMP = float(np.log(60.0))  # of lines of pulses, over their geometric mean: overlaps are wider
 
 FAR_SHARE, FAR_M = 0.1, 10.0  # of points outside of the header's bounds: see compare_bounds
 SAMPLE_POINTS = 100_000  # first points of a file, on which quantised coordinates are looked for
@@ -108,7 +112,7 @@ class PointTally:
     _days: Bools = field(default_factory=lambda: np.zeros(1 << 16, np.bool_))
     _sources: Ints = field(default_factory=lambda: np.zeros(STRIP_CODES, np.int64))
     _others: Ints = field(default_factory=lambda: np.zeros(STRIP_CODES, np.int64))
-
+    _edges: Floats = field(default_factory=lambda: np.zeros(7))
     _has_times: bool | None = None  # by the first point
     _sample: list[np.ndarray] = field(default_factory=list)
 
@@ -128,7 +132,7 @@ class PointTally:
         times = _times_of(fields, header)
         if header.global_encoding.gps_time_type.value == 1 and times is not None:
             _encode_days(times, self._days, attributes[0])
-        attributes[1] = self._strips_of(fields["point_source_id"].astype(np.uint32), times)
+        attributes[1] = self._strips_of(fields, raw, times)
         extended = header.point_format.id >= 6
         bit = 1 if extended else 32  # of the flags in LAS 1.4, and of the class byte before
         self.synthetic += int(np.count_nonzero(raw[:, 15] & bit))
@@ -145,16 +149,19 @@ class PointTally:
         )
         return xyz[:, :kept], attributes[0, :kept], attributes[1, :kept]
 
-    def _strips_of(self, source: Words, times: Floats | None) -> Words:
-        """``point_source_id`` [n], and above bit 15 the code of the time."""
-        if not source.size or times is None:
-            return source
+    def _strips_of(self, fields: np.ndarray, raw: Bytes, times: Floats | None) -> Words:
+        """``point_source_id`` [n], and above bit 15 the code of the time or the edges."""
+        code = fields["point_source_id"].astype(np.uint32)
+        if not len(code):
+            return code
         if self._has_times is None:
-            self._has_times = bool(times[0] != 0.0)
-        if not self._has_times:
-            return source
-        steps = np.floor(np.where(np.isfinite(times), times, 0.0) / BIN_S) % (STRIP_CODES - 1)
-        return source | np.where(times != 0.0, 1 + steps, 0).astype(np.uint32) << 16
+            self._has_times = times is not None and bool(times[0] != 0.0)
+        if self._has_times and times is not None:
+            steps = np.floor(np.where(np.isfinite(times), times, 0.0) / BIN_S) % (STRIP_CODES - 1)
+            return code | np.where(times != 0.0, 1 + steps, 0).astype(np.uint32) << 16
+        flags = raw[:, 15 if "classification_flags" in fields.dtype.names else 14]
+        _by_edges(flags, np.stack([fields["X"], fields["Y"]], axis=1), self._edges, code)
+        return code
 
     def count_strips(self, code: Words) -> None:
         """Count the codes of points that are kept."""
@@ -167,9 +174,11 @@ class PointTally:
         the points of each code."""
         told, bit = SOURCE, 0
         here = np.flatnonzero(self._others)
-        several = np.unique(runs_of(here[here > 0])).size > 1
-        if np.count_nonzero(self._sources) <= 1 and self._has_times and several:
-            told, bit = TIME, 16
+        if np.count_nonzero(self._sources) <= 1:
+            if not self._has_times and 1 < here.size <= MOST_BY_EDGES:
+                told, bit = EDGES, 16
+            elif self._has_times and np.unique(runs_of(here[here > 0])).size > 1:
+                told, bit = TIME, 16
         counts = self._others if bit else self._sources
         return told, bit, {str(code): int(counts[code]) for code in np.flatnonzero(counts)}
 
@@ -290,6 +299,30 @@ def _encode_days(times: Floats, seen: Bools, code: Words) -> None:
             day = EPOCH_DAY + np.int64((times[i] + ADJUSTED_S) / DAY_S)
             seen[day] = True
             code[i] = 1 + day % DAY_CODES
+
+
+@kernel
+def _by_edges(flags: Bytes, xy: NDArray[np.int32], state: Floats, code: Words) -> None:
+    """Add the number of each point's strip [n], from 0 on, above bit 15 of ``code``.
+
+    ``flags`` [n]: bytes with the flag of an edge in bit 7; ``xy`` [n, 2]: stored coordinates.
+    ``state`` [7]: strips before, edges of this one, mean logarithm of the steps between them, the
+    last two.
+    """
+    for i in range(flags.size):
+        if flags[i] >> 7:
+            x, y = np.float64(xy[i, 0]), np.float64(xy[i, 1])
+            step = min(np.hypot(x - state[3], y - state[4]), np.hypot(x - state[5], y - state[6]))
+            log_step = np.log(max(step, 1.0))
+            if state[1] > LEAST_EDGES and log_step > state[2] + LOG_JUMP:
+                state[0] += 1.0
+                state[1] = state[2] = 0.0
+            elif state[1] > 0.0:
+                state[2] += (log_step - state[2]) / state[1]
+            state[5], state[6] = (state[3], state[4]) if state[1] > 0.0 else (x, y)
+            state[3], state[4] = x, y
+            state[1] += 1.0
+        code[i] |= np.uint32(min(state[0], MOST_BY_EDGES)) << 16
 
 
 @inner

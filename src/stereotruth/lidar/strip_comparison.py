@@ -22,7 +22,7 @@ from ..core.numerics.arrays import Floats, Ints
 from ..core.numerics.geometry import DEGREE_M, exact_metres_per_degree
 from ..core.numerics.statistics import robust_sigma, tukey_weights
 from .lattice import CELL_BITS, CELL_DEG, LATTICE_DEG, LATTICE_M
-from .point_fields import BIN_S, SOURCE, TIME, runs_of
+from .point_fields import BIN_S, EDGES, SOURCE, TIME, runs_of
 from .point_store import SQUARES as CELL_SQUARES
 from .point_store import Points, PointStore
 from .strips import SHARE, Strip, StripKey, StripOffsets, more_of
@@ -133,7 +133,8 @@ class _Keys:
 def _name(key: StripKey, on_days: bool) -> str:
     if key.by == SOURCE:
         return f"{key.first} of {key.more or 'no day'}" if on_days else str(key.first)
-
+    if key.by == EDGES:
+        return f"{key.first + 1} of {key.more}"
     return f"from {(key.first - 1) * BIN_S:.0f} s on" if key.first else "without time"
 
 

@@ -28,7 +28,7 @@ from ..core.numerics.geometry import exact_metres_per_degree
 from ..core.products.files import atomic_folder, read_record, sealed
 from .cell_sort import SCRATCH_POINTS, SortedRuns, bounds_of
 from .lattice import CELL_BITS, CELL_DEG, PER_DEG, PER_M
-from .point_fields import NO_LIMITS, SOURCE, day_of
+from .point_fields import EDGES, NO_LIMITS, SOURCE, day_of
 from .point_store import SQUARES, PointStore
 
 log = logging.getLogger("stereotruth")
@@ -49,7 +49,8 @@ UNITS = {
 @dataclass(frozen=True, order=True)
 class StripKey:
     """What tells the points of a strip: the ``by`` of their store, codes from ``first`` to
-    ``last``, and ``more``: the day that they were measured on (ISO), or nothing."""
+    ``last``, and ``more``: the day that they were measured on (ISO), the file that they are of, or
+    nothing."""
 
     by: str
     first: int
@@ -180,8 +181,10 @@ class StripOffsets:
 
 
 def more_of(store: PointStore, day: int) -> str:
-    """What tells the strip of a point besides its code: the day for ``point_source_id``, which each
-    survey counts anew."""
+    """What tells the strip of a point besides its code: the file for numbers within it, and the day
+    for ``point_source_id``, which each survey counts anew."""
+    if store.strips_by == EDGES:
+        return store.path.stem
     return day_of(day) if day and store.strips_by == SOURCE else ""
 
 

@@ -29,10 +29,10 @@ def made(tmp_path_factory) -> list[PointStore]:
     return stores(tmp_path_factory.mktemp("strips"))
 
 
-@pytest.mark.parametrize("told", ["source", "time"])
+@pytest.mark.parametrize("told", ["source", "time", "edges"])
 def test_offsets_are_found_whatever_tells_the_strips(tmp_path, told):
-    """Strips that run through two files are one strip each."""
-    found = compare_strips(stores(tmp_path, told=told))
+    """Strips that run through two files are one strip each; by edges those of one file."""
+    found = compare_strips(stores(tmp_path, told=told, halves=told != "edges"))
     assert len(found.strips) == 3 and len(found.named) == 2
     of = offsets_of(found)
     first, *others = sorted(of, key=lambda name: int("".join(filter(str.isdigit, name))))
