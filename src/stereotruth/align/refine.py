@@ -296,10 +296,10 @@ def _widening(
     if scatter <= explained:
         return ratio
     doubts.append(
-        f"tie points scatter by {scatter:.2f} px of disparity, where the matches and the heights "
-        f"of a LiDAR explain {explained:.2f} px: without ground control points the images may have "
-        "been placed on other ground; check that the RPCs belong to the images, which may have "
-        "been cut since"
+        f"tie points scatter by {scatter:.3f} px of disparity, where the matches and the heights "
+        f"of a LiDAR explain {explained:.3f} px at most: without ground control points the images "
+        "may have been placed on other ground; check that the RPCs belong to the images, which may "
+        "have been cut since"
     )
     return max(ratio, (scatter / explained) ** 2)
 
