@@ -421,8 +421,9 @@ def _objection(result: _Found, with_gcps: bool) -> str:
         return "the tie points do not contradict the alignment"
     if after >= before and with_gcps:
         return (
-            "the tie points of one half of the scene fit the other half's less well than the "
-            f"control points do ({after:.2f} deviations, {before:.2f} before)"
+            "it would fit worse than the control points alone: tie points of one half of the scene "
+            f"are off by {before:.2f} standard deviations in the mean, and by {after:.2f} once "
+            "those of the other half have moved the images"
         )
     return ""
 

@@ -402,8 +402,8 @@ def frame_change(
         legs.append(f"ITRF2020 from {own:.3f} to {goal:.3f} with the plate {plate}")
     if not target.by and plate is not None:
         notes.append(
-            f"the date of the images is not known, it is taken as {goal:g}: places in ITRF2020 "
-            f"move by {1000 * m_a:.0f} mm a year here"
+            f"the date of the images is not known, it is taken as {goal:g} (column epoch of the "
+            f"cities sheet states it): places in ITRF2020 move by {1000 * m_a:.0f} mm a year here"
         )
     known = [operation.accuracy for operation in way.operations]
     accuracy = None if any(value < 0 for value in known) else float(sum(known)) + way.spread_m

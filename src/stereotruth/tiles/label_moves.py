@@ -137,8 +137,8 @@ def worst_point(alignment: Mapping[str, Any]) -> tuple[float, str]:
         for point, length in zip(points, lengths):
             if median := float(np.median(lengths)):
                 text = f"worst control point {point['id']} ({view} image): "
-                text += f"{math.hypot(*point['after']):.2f} px; left out of the fit, "
-                text += f"{length / median:.1f} times the median of all"
+                text += f"{math.hypot(*point['after']):.2f} px off the fit, {length:.2f} px off "
+                text += f"that of the others, {length / median:.1f} times the median of such"
                 found.append((length / median, text))
     return max(found)
 
