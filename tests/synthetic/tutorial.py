@@ -46,10 +46,10 @@ class Session:
     """Commands one after the other in a shell that finds ``stereotruth``; ``cd`` lasts."""
 
     def __init__(self, folder: Path) -> None:
-        """Begin in an empty folder."""
+        """Begin in a folder."""
         self.place = folder
         program = folder / ".bin/stereotruth"
-        program.parent.mkdir()
+        program.parent.mkdir(exist_ok=True)
         program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m stereotruth.project.main "$@"\n')
         program.chmod(0o755)
         paths = (program.parent, Path(sys.executable).parent, os.environ["PATH"])

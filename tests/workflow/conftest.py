@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ import yaml
 from stereocities.sites import make_scene
 
 from ..synthetic.project import SIZE, TINY, Project, copy_project, row_of
+from ..synthetic.tutorial import PAGE, Session, commands
 
 
 @pytest.fixture
@@ -79,6 +81,22 @@ def made(data, once, tmp_path_factory) -> Project:
         assert "Look at tiles/Tiny/manifest.csv" in run.text
 
     return Project(once("made", make)).copy(tmp_path_factory.mktemp("made") / "project")
+
+
+@pytest.fixture(scope="session")
+def toured(once) -> Path:
+    """A folder in which the commands of docs/tutorial.md have been given.
+
+    ``said.json``: of each its exit status and lines. ``demo``: the example, nothing made of it.
+    """
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        session = Session(folder)
+        said = [session.run(command) for command, _ in commands(PAGE.read_text("utf-8"))]
+        (folder / "said.json").write_text(json.dumps(said))
+
+    return once("toured", make)
 
 
 FUNCTION = """

@@ -9,11 +9,13 @@ import hashlib
 import os
 import random
 import signal
-import subprocess
-import sys
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+
+from ..synthetic.forked_snakemake import runner, start_snakemake
+from ..synthetic.forks import Fork
 
 VICTIMS = ("worker", "snakemake", "tree")
 PRODUCTS = ("results/rectify", "results/project", "results/export", "tiles")
@@ -37,19 +39,12 @@ def family(pid: int) -> tuple[list[int], list[int]]:
     return found, [process for process in found if process not in parents]
 
 
-def start(folder: Path, *arguments: str) -> subprocess.Popen:
-    """Snakemake in a session of its own; what it says goes to run.log."""
-    with (folder / "run.log").open("a") as stream:
-        return subprocess.Popen(
-            [sys.executable, "-m", "snakemake", "--cores", "2", *arguments],
-            cwd=folder,
-            stdout=stream,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
+def start(folder: Path, *arguments: str) -> Fork:
+    """Snakemake in a session of its own, whose jobs are forks; what it says goes to run.log."""
+    return start_snakemake(runner(), folder, ["--cores", "2", *arguments], "run.log")
 
 
-def kill(run: subprocess.Popen, victim: str) -> None:
+def kill(run: Fork, victim: str) -> None:
     """SIGKILL to one of VICTIMS; of a killed worker's run, wait for the end."""
     below, workers = family(run.pid)
     chosen = {"worker": workers[-1:], "snakemake": [run.pid], "tree": [run.pid, *below]}[victim]
@@ -95,10 +90,12 @@ def disturb(
         run = start(folder, *arguments)
         wait = rng.uniform(0.5, longest)
         victim = rng.choice(VICTIMS)
-        try:
-            run.wait(wait)
+        end = time.monotonic() + wait
+        while run.poll() is None and time.monotonic() < end:
+            time.sleep(0.02)
+        if run.poll() is not None:
             yield f"kill {number + 1}: the run had ended before"
-        except subprocess.TimeoutExpired:
+        else:
             kill(run, victim)
             yield f"kill {number + 1}: {victim} after {wait:.1f} s, {len(records(folder))} blocks"
         now = records(folder)

@@ -47,21 +47,6 @@ def own(made, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.slow
-def test_the_example_is_checked_and_can_be_made(tmp_path):
-    """In a folder that was empty. The tutorial's scene and the example site are made."""
-    demo = tmp_path / "demo"
-    run = call("init", "--example", "demo", folder=tmp_path)
-    assert run.status == 0, run.text
-    checked = call("check", folder=demo)
-    assert checked.status == 0, checked.text
-    assert "0 errors, 0 doubts: a run can begin" in checked.text
-    plan = call("run", "tiles/Demo", "--cores", "2", "--dry-run", folder=demo)
-    assert plan.status == 0 and "export" in plan.text, plan.text[-4000:]
-    planned = call("run", "report", "--dry-run", folder=demo)  # a page with the exact truth
-    assert re.search(r"^evaluate_truth_city +1 +\d+ +\d+ +\d+", planned.text, re.M), planned.text
-
-
 OWN_RULE = """
 rule mine:
     default_target: True

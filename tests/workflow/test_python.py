@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -14,20 +15,30 @@ from stereotruth.core.products.grids import open_grid
 from stereotruth.project.label_pair import label_pair
 
 from ..synthetic.notebook import BLOCK, NOTEBOOK, code_cells, run_code
-from ..synthetic.project import ROOT
+from ..synthetic.project import ROOT, Project
 from ..synthetic.tutorial import Session, agrees
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With the example, and its tiles."""
-    session = Session(tmp_path_factory.mktemp("python"))
-    for command in ("stereotruth init --example demo", "cd demo", "stereotruth run tiles/Demo"):
-        status, said = session.run(command)
-        assert status == 0, "\n".join(said[-40:])
-    return session.place.parent
+def folder(toured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With the example, and its tiles and dataset."""
+    folder = tmp_path_factory.mktemp("python")
+    demo = Project(Path(shutil.copytree(toured / "demo", folder / "demo")))
+    settings = ("--snakefile", str(ROOT / "Snakefile"), "--configfile", "config.yaml")
+    run = demo.snakemake("tiles/Demo", "dataset", *settings)
+    assert run.status == 0, run.text[-4000:]
+    return folder
+
+
+def test_the_example_is_checked_and_its_page_has_the_exact_truth(toured: Path) -> None:
+    session = Session(toured)
+    session.run("cd demo")
+    status, lines = session.run("stereotruth check")
+    assert status == 0 and "0 errors, 0 doubts: a run can begin" in lines[-1], lines
+    _, plan = session.run("stereotruth run report --dry-run")
+    assert any(re.match(r"evaluate_truth_city +1 +\d+ +\d+ +\d+", line) for line in plan), plan
 
 
 def said(outputs: list[dict]) -> list[str]:
@@ -58,6 +69,12 @@ def test_every_example_of_the_page_runs(folder: Path) -> None:
     for number, example in enumerate(examples):
         (outputs,) = run_code([example], folder / "demo")
         assert outputs, f"example {number} says nothing"
+
+
+def test_tiles_are_read_by_the_lines_of_the_guide(folder: Path) -> None:
+    guide = (ROOT / "docs/how-to/pytorch.md").read_text(encoding="utf-8")
+    (outputs,) = run_code([BLOCK.search(guide)[1]], folder / "demo")
+    assert len(said(outputs)) == 2 and "(256, 256)" in said(outputs)[0], outputs
 
 
 def test_what_is_wrong_is_told_as_in_a_run(folder: Path) -> None:
