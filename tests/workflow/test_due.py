@@ -144,7 +144,7 @@ def test_jobs_that_fail_are_made_again_with_all_that_follows(made):
     made.set_seed(1)
     for file in EDITS:
         made.edit(file)
-    reached = sorted(made.make())
+    reached = sorted(made.plan())
     assert len(reached) > 20
     failed: set[str] = set()
     for number, way in enumerate(FAILS):

@@ -1,4 +1,4 @@
-"""A stack of images from its sheet to tiles and heights, by the program alone."""
+"""A stack of images from its sheet to tiles and heights."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from stereotruth.lidar.catalogue_list import ListedTile, TileList, write_list
 from stereotruth.lidar.lattice import Footprint
 from stereotruth.project.simulated_project import SITE
 from stereotruth.tiles.verify import defects
+
+from ..synthetic.project import ROOT, Project
 
 pytestmark = pytest.mark.slow
 COMMAND = [sys.executable, "-m", "stereotruth.project.main"]
@@ -65,7 +67,7 @@ def list_of_tiles(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
-    """The example, two pairs of it, made."""
+    """The example, two pairs of it, made: the tiles by forks, the rest by programs."""
     empty = tmp_path_factory.mktemp("empty")
     call(empty, "init", "--example", "site")
     folder = empty / "site"
@@ -75,6 +77,9 @@ def site(tmp_path_factory) -> Path:
     assert "0 errors, 0 doubts" in call(folder, "check")
     with (folder / "config.yaml").open("a", encoding="utf-8") as config:
         config.write("dataset: {original_heights: true}\n")
+    settings = ("--snakefile", str(ROOT / "Snakefile"), "--configfile", "config.yaml")
+    made = Project(folder).snakemake("tiles/Stack", *settings)
+    assert made.status == 0, made.text[-4000:]
     call(folder, "run", "heights", "originals/Stack", "report", "--cores", "2")
     return folder
 
