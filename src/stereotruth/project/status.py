@@ -124,10 +124,15 @@ class CityStatus:
         return "out of date" if self.made else "not made"
 
     def why(self) -> list[str]:
-        """What a run would do, and the causes of it, the most frequent first."""
-        if not self.jobs:
-            return []
+        """What a run would do, and the causes of it, the most frequent first.
+
+        Figures and pages that were never made of tiles that are up to date are nothing to do.
+        """
         jobs = sorted(self.jobs, key=lambda job: job.rule in AFTER_TILES)
+        if self.state == "up to date":
+            jobs = [job for job in jobs if MISSING not in job.reason]
+        if not jobs:
+            return []
         rules = Counter(job.rule for job in jobs)
         lines = [", ".join(f"{rule} {count}" for rule, count in rules.items())]
         causes: dict[str, list[str]] = {}

@@ -33,7 +33,7 @@ from ..core.errors import InputError, in_number
 from ..core.products.files import files_below, plain_name, read_sealed
 from ..core.products.provenance import file_sha256
 from ..core.products.rasters import read_disparity, read_image, read_labels
-from .manifest import NO_TRUTH, NONE, PATHS, SPLITS, SUM, manifest_rows
+from .manifest import CHANGED, CHANGED_REMEDY, NO_TRUTH, NONE, PATHS, SPLITS, SUM, manifest_rows
 from .manifest import column as column_of
 from .seals import Seal
 
@@ -73,24 +73,20 @@ class Pair:
     row: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
     sealed: str = field(default="", repr=False, compare=False)
 
-    def refuse_changed(self) -> None:
-        """Raise InputError if a file is not the one that the manifest has the checksum of."""
-        files = zip(PATHS, (self.left, self.right, self.disparity))
-        for column, file in files:
+    def changed(self) -> Iterator[InputError]:
+        """What is to be said of files that are not those which the manifest or the seal lists."""
+        for column, file in zip(PATHS, (self.left, self.right, self.disparity)):
             known = self.row.get(f"{column}{SUM}")
             if file is not None and known and file_sha256(file) != known:
-                raise InputError(
-                    "is not what its manifest has the checksum of",
-                    file=file,
-                    remedy="get or make the dataset again; or delete the manifest, if the edit "
-                    "was yours",
-                )
+                yield InputError(CHANGED, file=file, remedy=CHANGED_REMEDY)
         if self.sealed and self.disparity and file_sha256(self.disparity) != self.sealed:
-            raise InputError(
-                "is not the label that was sealed",
-                file=self.disparity,
-                remedy="open the seal again with the labels that it was made of",
-            )
+            remedy = "open the seal again with the labels that it was made of"
+            yield InputError("is not the label that was sealed", file=self.disparity, remedy=remedy)
+
+    def refuse_changed(self) -> None:
+        """Raise InputError if a file is not the one that the manifest has the checksum of."""
+        for error in self.changed():
+            raise error
 
 
 @dataclass(frozen=True)

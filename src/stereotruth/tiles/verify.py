@@ -10,7 +10,7 @@ from pathlib import Path
 from ..core.errors import InputError
 from ..core.products.files import is_foreign, read_json
 from ..core.products.provenance import file_sha256, own_digest
-from .manifest import FOOTPRINTS, STATUS_COLOURS_FILE, STYLE, SUM, read_manifest
+from .manifest import FOOTPRINTS, STATUS_COLOURS_FILE, STYLE, listed_files
 
 log = logging.getLogger("stereotruth")
 
@@ -33,7 +33,7 @@ def defects(folder: str | Path) -> list[str]:
     folder = Path(folder)
     found = []
     listed = set()
-    for name, checksum in _listed(folder):
+    for name, checksum in listed_files(folder):
         listed.add(name)
         if not (folder / name).is_file():
             found.append(f"{name}: missing")
@@ -66,16 +66,6 @@ def defects(folder: str | Path) -> list[str]:
     return found
 
 
-def _listed(folder: Path) -> list[tuple[str, str]]:
-    """Files of a folder that its manifest lists, with their checksums."""
-    return [
-        (row[key.removesuffix(SUM)], row[key])
-        for row in read_manifest(folder)
-        for key in row
-        if key.endswith(SUM) and row[key.removesuffix(SUM)]
-    ]
-
-
 def _is_foreign(path: Path) -> bool:
     return path.name != STYLE and is_foreign(path.name)
 
@@ -99,7 +89,7 @@ def verify(folders: Iterable[str | Path]) -> dict[str, int]:
         bad += [f"{folder}/{line}" for line in found]
         for line in found:
             log.error("%s/%s", folder, line)
-        counts[str(folder)] = count = len(_listed(folder))
+        counts[str(folder)] = count = len(listed_files(folder))
         if foreign := foreign_files(folder):
             more = f" and {len(foreign) - 5} more" if len(foreign) > 5 else ""
             log.info(
