@@ -193,14 +193,14 @@ def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
     entry.check_maps(dataset, table.pairs)
     work = folder / WORK / dataset.name / entry.name
     maps, scores = work / "maps", work / "scores"
-    place = entry.submission.folder
-    program = [place / name for name in entry.submission.files] if entry.program else []
+    place = entry.folder
+    program = [place / name for name in entry.files] if entry.program else []
     settings = entry.settings(work / "program")
     predict(dataset, split, entry.name, settings, maps, work=work / "pairs", files=program)
     label = entry.facts["label"]
     summary = score(dataset, split, label, maps, scores, table.plan, products=table.products)
-    if program and entry.submission.scores:
-        hold_against(entry.submission.scores, summary)
+    if program and entry.scores:
+        hold_against(entry.scores, summary)
     shown = ((p.name, read_prediction(maps, p), table.truth(p)) for p in table.pairs)
     entry.refuse_doubts(summary["doubts"], dataset, shown)
     return Run(entry, summary, maps, scores)

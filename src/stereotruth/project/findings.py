@@ -38,6 +38,20 @@ class Finding:
     remedy: str = ""
 
 
+@contextmanager
+def heard(name: str, level: int = logging.NOTSET) -> Iterator[list[logging.LogRecord]]:
+    """What a logger is told in the block, from a level on."""
+    records: list[logging.LogRecord] = []
+    listener = logging.Handler(level)
+    listener.emit = records.append
+    logger = logging.getLogger(name)
+    logger.addHandler(listener)
+    try:
+        yield records
+    finally:
+        logger.removeHandler(listener)
+
+
 class Findings(list[Finding]):
     """What is found of one scene; InputErrors and warnings of the stages become findings."""
 
@@ -62,36 +76,22 @@ class Findings(list[Finding]):
 
         So is what the operating system refuses.
         """
-        heard: list[str] = []
-        handler = _Listener(heard)
-        log = logging.getLogger("stereotruth")
-        log.addHandler(handler)
-        try:
-            yield
-        except InputError as error:
-            self.error(about, error)
-        except OSError as error:  # no permission, or gone in this moment
-            if (told := told_by_system(error)) is None:
-                raise
-            self.error(about, told)
-        finally:
-            log.removeHandler(handler)
-        for text in heard:
-            self.say(about, Level.DOUBT, text.removeprefix("warning: "))
+        with heard("stereotruth", logging.WARNING) as records:
+            try:
+                yield
+            except InputError as error:
+                self.error(about, error)
+            except OSError as error:  # no permission, or gone in this moment
+                if (told := told_by_system(error)) is None:
+                    raise
+                self.error(about, told)
+        for record in records:
+            self.say(about, Level.DOUBT, record.getMessage().removeprefix("warning: "))
 
     @property
     def failed(self) -> bool:
         """Whether a run would fail."""
         return any(finding.level is Level.ERROR for finding in self)
-
-
-class _Listener(logging.Handler):
-    def __init__(self, heard: list[str]) -> None:
-        super().__init__(logging.WARNING)
-        self.heard = heard
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.heard.append(record.getMessage())
 
 
 STYLES = {Level.FACT: "green", Level.DOUBT: "yellow", Level.ERROR: "bold red"}

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
-import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,7 +23,7 @@ from ..core.products.files import read_json
 from ..evaluate.report.index_page import PAGES
 from ..tiles.label_moves import moves, sample_labels, worst_point
 from ..tiles.manifest import read_manifest
-from .findings import plain_table, wide
+from .findings import heard, plain_table, wide
 from .project import configured, read_scenes, require_scenes, sheet
 from .run_workflow import arguments_for
 
@@ -59,20 +58,6 @@ class PlannedJob:
         return [part for part in parts if part and not part.startswith(FOLLOWS)]
 
 
-@contextlib.contextmanager
-def _heard(name: str, kept: list[logging.LogRecord]) -> Iterator[None]:
-    class Listener(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            kept.append(record)
-
-    logger, listener = logging.getLogger(name), Listener()
-    logger.addHandler(listener)
-    try:
-        yield
-    finally:
-        logger.removeHandler(listener)
-
-
 def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> list[PlannedJob]:
     """The jobs that a run of the targets would do. Raises InputError if there is no plan."""
     from snakemake.cli import main
@@ -80,10 +65,9 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
     given = [*targets, "--dry-run", "--cores", "1"]
     if configfiles:
         given += ["--configfile", *map(str, configfiles)]
-    said, records = io.StringIO(), []
-    status: object = 0
+    said, status = io.StringIO(), 0
     with (
-        _heard("snakemake", records),
+        heard("snakemake") as records,
         contextlib.redirect_stdout(said),
         contextlib.redirect_stderr(said),
     ):
