@@ -14,7 +14,7 @@ from ..lidar.frames import Epoch
 from ..tiles.scene_stores import cell_step
 from .check_scene import Looked, check_scene
 from .expected import check_resources, duration
-from .findings import Findings, Level
+from .findings import Findings
 from .project import (
     adjusted_scenes,
     check_fixed,
@@ -68,7 +68,7 @@ def check_project(
     with project.of("configuration"):
         require_scenes(configfiles)
         settings, files = configured(configfiles)
-        project.say("configuration", Level.FACT, files)
+        project.fact("configuration", files)
         tiles = settings.tiles
         cell_step(tiles.size, tiles.stride or tiles.size)
     if settings is None:
@@ -86,7 +86,7 @@ def check_project(
         scenes = found
         towns = len({scene.city for scene in scenes.values()})
         count = f"{in_number(len(scenes), 'scene')} of {towns} {'city' if towns == 1 else 'cities'}"
-        project.say("sheets", Level.FACT, count)
+        project.fact("sheets", count)
     if scenes is None:
         return [project]
     in_sheet = {name: names_in_pair(scene, images) for name, scene in every_scene.items()}
@@ -135,7 +135,7 @@ def _check_synthetic(scene: Scene, found: Findings) -> None:
         city = city_of(scene.city)
         words = "images, LiDAR and truth are made by the run"
         if city.twin is None:
-            found.say("input", Level.FACT, f"synthetic: {words}")
+            found.fact("input", f"synthetic: {words}")
             return
         for file in city.twin.files:
             if not Path(file).is_file():
@@ -144,4 +144,4 @@ def _check_synthetic(scene: Scene, found: Findings) -> None:
                     file=file,
                     remedy=f"put it back, or correct its path in {file_of(city.name)}",
                 )
-        found.say("input", Level.FACT, f"twin of {city.twin.file}: {words}")
+        found.fact("input", f"twin of {city.twin.file}: {words}")

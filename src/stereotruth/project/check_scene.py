@@ -107,9 +107,8 @@ def _check_images(scene: Scene, settings: Configuration, looked: Looked, found: 
             good = False
             said = any(f.text.startswith(str(image)) for f in found[before:])
             if not said and not any(f"{view}_image" in f.text for f in found):
-                found.say(
+                found.fault(
                     "files",
-                    Level.ERROR,
                     f"{image}: {view}_image does not exist",
                     "correct the path (relative to the working directory, or absolute)",
                 )
@@ -188,7 +187,7 @@ def _or_of_others(alone: bool, found: Findings) -> Iterator[None]:
     except TooFewPoints as error:
         if alone:
             raise
-        found.say("GCPs", Level.FACT, f"{error.problem}: placed by other images and tie points")
+        found.fact("GCPs", f"{error.problem}: placed by other images and tie points")
 
 
 def _check_alignment(
@@ -224,7 +223,7 @@ def _check_alignment(
             used = [sum(gcp.used for gcp in fit.gcps) for fit in alignment.fits]
             sigma = max(fit.rms("after") for fit in alignment.fits)
             text = f"{used[0]} and {used[1]} of {len(gcps.ids)} used, {sigma:.2f} px rms at most"
-            found.say("GCPs", Level.FACT, text)
+            found.fact("GCPs", text)
         elif images and not scene.gcps:
             alignment = from_rpcs(*pair, model=model, scene=name, provenance={})
     if alignment is None and images:  # to hold the LiDAR against the images all the same
@@ -246,16 +245,14 @@ def _check_pair(alignment: Alignment, scene: Scene, found: Findings) -> Epipolar
     rows, cols = model.shape
     report = model.report
     pixel = np.sqrt(pixel_m2(model))
-    found.say(
+    found.fact(
         "images",
-        Level.FACT,
         f"{cols} x {rows} px of {pixel:.2f} m in common, convergence "
         f"{report['convergence_angle_deg']:.1f} degrees, {report['view_order']}",
     )
     if report["view_order"] == "left looks forward":
-        found.say(
+        found.doubt(
             "images",
-            Level.DOUBT,
             "the left image is the forward view; in the paper's data it is the backward one",
             "exchange left_image and right_image if disparities should be as the paper's",
         )
@@ -283,9 +280,8 @@ def _hold_against_gcps(
             off.append(height - high)
     if here and 2 * len(off) > here:
         shift = float(np.median(off))
-        found.say(
+        found.doubt(
             "heights",
-            Level.DOUBT,
             f"{len(off)} of {here} GCPs lie {'below' if shift < 0 else 'above'} every LiDAR point "
             f"of their files, by {abs(shift):.1f} m in the middle",
             "check the LiDAR's vertical datum and unit (geoid, feet), and that the GCPs' heights "
@@ -339,9 +335,8 @@ def _hold_against_images(
         margin = (high - low) / 4
         middle = np.median([np.mean(file.heights) for file in placed])
         if not low - margin <= middle <= high + margin:
-            found.say(
+            found.doubt(
                 "heights",
-                Level.DOUBT,
                 f"the LiDAR, about {middle:.0f} m, is outside the {low:.0f} to {high:.0f} m of the "
                 "RPC",
                 "check that its heights are ellipsoidal metres",

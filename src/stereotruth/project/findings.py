@@ -64,11 +64,22 @@ class Findings(list[Finding]):
         if not any((f.about, f.level, f.text) == (about, level, text) for f in self):
             self.append(Finding(self.scene, about, level, text, remedy))
 
+    def fact(self, about: str, text: str) -> None:
+        """Add what is so."""
+        self.say(about, Level.FACT, text)
+
+    def doubt(self, about: str, text: str, remedy: str = "") -> None:
+        """Add what a run goes through with, and may not be what is wanted."""
+        self.say(about, Level.DOUBT, text, remedy)
+
+    def fault(self, about: str, text: str, remedy: str = "") -> None:
+        """Add what a run would fail of."""
+        self.say(about, Level.ERROR, text, remedy)
+
     def error(self, about: str, error: InputError) -> None:
         """Add what a stage refuses; of a sheet all that is wrong in it."""
         for each in error.each if isinstance(error, SheetError) else (error,):
-            where = f"{each.file}: " if each.file else ""
-            self.say(about, Level.ERROR, f"{where}{each.problem}", each.remedy)
+            self.fault(about, f"{each.file}: " * bool(each.file) + each.problem, each.remedy)
 
     @contextmanager
     def of(self, about: str) -> Iterator[None]:
@@ -86,7 +97,7 @@ class Findings(list[Finding]):
                     raise
                 self.error(about, told)
         for record in records:
-            self.say(about, Level.DOUBT, record.getMessage().removeprefix("warning: "))
+            self.doubt(about, record.getMessage().removeprefix("warning: "))
 
     @property
     def failed(self) -> bool:
