@@ -143,16 +143,14 @@ def read_sums(folder: str | Path, columns: Mapping[str, tuple[str, str]]) -> dic
 
 def _columns_of(folder: str | Path) -> dict[str, tuple[str, str]]:
     """The figures that a folder of scores has by tile."""
-    if (Path(folder) / "tiles.csv").is_file():
+    if Path(folder, "tiles.csv").is_file():
         return {
             "height off steps, m": ("points", "mean_absolute_m"),
             "edges, m": ("edges", "position_error_m"),
             "resolution of edges, m": ("edges", "resolution_m"),
         }
-    rows = (
-        read_table(Path(folder) / "scores.csv") if (Path(folder) / "scores.csv").is_file() else ()
-    )
-    names = next(iter(rows), {})
+    scores = Path(folder, "scores.csv")
+    names = next(read_table(scores), {}) if scores.is_file() else {}
     d1 = [name for name in names if name.startswith("filled_d1_")]
     return {"EPE, px": ("labelled", "filled_epe_px"), **{n: ("labelled", n) for n in d1}}
 

@@ -52,7 +52,8 @@ Hengyang   3.885 39.18   3.553 34.85   2.539 19.62
 
 PAPER = "Li et al., IEEE TGRS 2023, table 5"
 LATER = "READMEs of later networks"
-INVALID = "how pixels that SGM leaves invalid count, SGM's settings"
+LACKING = "pair list; whether labels beyond the range count"
+INVALID = "; how pixels that SGM leaves invalid count, SGM's settings"
 LITTLE = "pair list, range, mask, pooling; whether trained and scored by one program"
 ORDER = f"{LITTLE}; the networks are taken to stand in the order of those of WHU-Stereo"
 
@@ -78,16 +79,12 @@ class Published:
     not_known: str
 
 
-def _paper(kind: str, epe: float, d1: float) -> Published:
-    lacking = "pair list; whether labels beyond the range count"
-    return Published(
-        KINDS[kind].label, epe, d1, PAPER, f"{lacking}; {INVALID}" if kind == "sgm" else lacking
-    )
-
-
 PUBLISHED = {
     "whu-2023": (
-        *(_paper(kind, epe, d1) for kind, (epe, d1, _) in TABLE5.items()),
+        *(
+            Published(KINDS[kind].label, epe, d1, PAPER, LACKING + INVALID * (kind == "sgm"))
+            for kind, (epe, d1, _) in TABLE5.items()
+        ),
         Published("TGRNet", 1.586, 12.63, LATER, LITTLE),
         Published("RAFT-Stereo", 1.729, 14.12, LATER, LITTLE),
         Published("HMSM-Net, again", 2.040, 19.00, LATER, f"{LITTLE}; why not the paper's 1.672"),

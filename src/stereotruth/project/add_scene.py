@@ -164,7 +164,8 @@ def add_scene(
     first = delivery[0].absolute()
     folder = first if first.is_dir() else first.parent
     city = city or re.sub(r"[^A-Za-z0-9-]+", "-", folder.name).strip("-") or "City"
-    name = name or _unused(city, scenes)
+    numbered = (f"{re.sub(r'[^A-Za-z0-9-]', '-', city)}-{k}" for k in range(1, 10_000))
+    name = name or next(name for name in numbered if name not in scenes)
     if name in scenes:
         raise InputError(
             f"scene {name!r} is there already", file=rows, remedy="take another --name"
@@ -279,12 +280,6 @@ def in_order(
     if order == "left looks forward":
         words += " (the backward view is left in the paper's data)"
     return (one, other), model, [f"left: {one.path}", f"right: {other.path}", words]
-
-
-def _unused(city: str, scenes: dict[str, sheets.Scene]) -> str:
-    """The first of City-1, City-2 … that no scene has."""
-    base = re.sub(r"[^A-Za-z0-9-]", "-", city)
-    return next(name for k in range(1, 10_000) if (name := f"{base}-{k}") not in scenes)
 
 
 def _prefix(city: str, cities: dict[str, sheets.City]) -> str:

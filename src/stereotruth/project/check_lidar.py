@@ -100,7 +100,8 @@ def check_lidar(
         looked = list(pool.map(look, files))
     surveyed = [item for item in looked if isinstance(item, SurveyedFile)]
     errors = [item for item in looked if isinstance(item, InputError)]
-    for problem, (error, count) in _by_text(errors).items():
+    for problem, count in Counter(error.problem for error in errors).items():
+        error = next(error for error in errors if error.problem == problem)
         name = error.file or "LiDAR"
         more = f" (and {count - 1} more files)" if count > 1 else ""
         found.fault("LiDAR", f"{name}{more}: {problem}", error.remedy)
@@ -151,12 +152,3 @@ def _say_what_is_read(surveyed: Sequence[SurveyedFile], found: Findings) -> None
         f"a run reads {touched} of {in_number(len(surveyed), 'file')}, {points / 1e6:.1f} of "
         f"{every[0] / 1e6:.1f} M points, {size / 1e6:.1f} of {every[1] / 1e6:.1f} MB",
     )
-
-
-def _by_text(errors: Sequence[InputError]) -> dict[str, tuple[InputError, int]]:
-    """First error and number of errors of each problem."""
-    counts = Counter(error.problem for error in errors)
-    return {
-        problem: (next(e for e in errors if e.problem == problem), count)
-        for problem, count in counts.items()
-    }

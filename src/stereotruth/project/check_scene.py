@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from rasterio.errors import RasterioError
 
 from ..align.align import align, from_rpcs
@@ -137,7 +136,9 @@ def _check_pixels(image: Path, bands: Mapping[str, Any]) -> None:
     """Raise InputError as rule rectify does; what would take long to read is left to it."""
     try:
         with open_raster(image) as dataset:
-            pixels, sampled = dataset.width * dataset.height, _is_sampled(dataset)
+            pixels, dtype = dataset.width * dataset.height, (*dataset.dtypes, "")[0]
+        # to scale values of these types, a source reads all over the image when it is opened
+        sampled = dtype.startswith(("float", "int32", "uint32", "int64", "uint64"))
     except RasterioError:
         pixels, sampled = 0, False  # a source says what is wrong
     small = image.stat().st_size <= WHOLE_BYTES and pixels <= WHOLE_PIXELS
@@ -171,12 +172,6 @@ def _refuse_empty(source: Source, *, whole: bool) -> None:
         file=source.path,
         remedy="check the image and its nodata value",
     )
-
-
-def _is_sampled(dataset: rasterio.DatasetReader) -> bool:
-    """Whether opening an image as a source reads all over it, to scale its values."""
-    dtype = dataset.dtypes[0] if dataset.count else ""
-    return dtype.startswith("float") or dtype in ("int32", "uint32", "int64", "uint64")
 
 
 @contextmanager

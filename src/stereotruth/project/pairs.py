@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
@@ -79,7 +80,9 @@ class Choice:
         """
         allowed = [rated for rated in pairs if self.allows(rated.pair)]
         most = len(allowed) if self.most is None else self.most
-        selection = _linking(allowed, self.each)
+        selection = _Selection(allowed, self.each)
+        while selection.choose(lambda names: new_links([names], selection.chosen)):
+            pass
         if len(selection.chosen) > most:
             selection = _growing(allowed, self.each, most)
         while len(selection.chosen) < most and selection.choose():
@@ -102,7 +105,12 @@ class _Selection:
 
     def choose(self, wanted: Callable[[Names], object] = lambda _: True) -> bool:
         """Choose the best of those ``wanted``, by names; false if there is none."""
-        free = [names for names in self.remaining if self._may(names) and wanted(names)]
+        most = math.inf if self.each is None else self.each
+        free = [
+            names
+            for names in self.remaining
+            if max(self.used[name] for name in names) < most and wanted(names)
+        ]
         if not free:
             return False
         best = max(
@@ -115,17 +123,6 @@ class _Selection:
         self.used.update(best)
         self.chosen.append(best)
         return True
-
-    def _may(self, names: Names) -> bool:
-        return self.each is None or max(self.used[name] for name in names) < self.each
-
-
-def _linking(pairs: Sequence[RatedPair], each: int | None) -> _Selection:
-    """The best pairs that link all images which any of the ``pairs`` has."""
-    selection = _Selection(pairs, each)
-    while selection.choose(lambda names: new_links([names], selection.chosen)):
-        pass
-    return selection
 
 
 def _growing(pairs: Sequence[RatedPair], each: int | None, most: int) -> _Selection:

@@ -11,7 +11,6 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -236,9 +235,13 @@ def write_layout(
     """
     dataset = Path(dataset)
     rows = [row for row in read_manifest(dataset) if row["disp"]]
+
+    def load(row: Mapping[str, str]) -> packages.Sample:
+        images = (read_image(dataset / row[view]) for view in ("left", "right"))
+        return packages.sample_of(row, *images, read_labels(dataset / row["disp"])[0])
+
     with atomic_folder(out) as scratch:
         if layout in packages.NAMES:
-            load = partial(_sample, dataset)
             table = packages.write_packages(scratch, rows, load, layout, licence)
         else:
             reported = progress(rows, len(rows), f"dataset as {layout}: pairs")
@@ -248,11 +251,6 @@ def write_layout(
             write_table(scratch / "manifest.csv", table)
     log.info("%s: %d pairs", out, len(rows))
     return len(rows)
-
-
-def _sample(dataset: Path, row: Mapping[str, str]) -> packages.Sample:
-    images = (read_image(dataset / row[view]) for view in ("left", "right"))
-    return packages.sample_of(row, *images, read_labels(dataset / row["disp"])[0])
 
 
 def _write_pair(
@@ -284,12 +282,6 @@ def _put_png(path: Path, image: NDArray[Any]) -> None:
         raise InputError("cannot be written", file=path, remedy="see that there is space")
 
 
-def shift_of(disparity: NDArray[np.float32]) -> int:
-    """By how many px a right image is moved so that no disparity is below 1 px."""
-    known = disparity[np.isfinite(disparity)]
-    return max(0, int(np.ceil(1.0 - float(known.min())))) if known.size else 0
-
-
 def moved(image: NDArray[Any], shift: int) -> NDArray[Any]:
     """An image moved to the left by ``shift`` px; 0 comes in from the right."""
     out = np.zeros_like(image)
@@ -299,7 +291,8 @@ def moved(image: NDArray[Any], shift: int) -> NDArray[Any]:
 
 
 def _kitti(folder: Path, pair: _Pair) -> tuple[dict[str, str], dict[str, Any]]:
-    shift = shift_of(pair.disparity)
+    known = pair.disparity[np.isfinite(pair.disparity)]
+    shift = max(0, int(np.ceil(1.0 - float(known.min())))) if known.size else 0  # none below 1 px
     steps = np.rint((pair.disparity.astype(np.float64) + shift) * KITTI_STEPS)
     beyond = steps > 65535
     steps = np.where(np.isfinite(steps) & ~beyond, steps, 0.0).astype(np.uint16)

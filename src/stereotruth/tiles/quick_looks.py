@@ -308,7 +308,9 @@ def _write(
 
 def feature(row: Mapping[str, Any], ring: NDArray[np.float64]) -> dict[str, Any]:
     """A tile as a GeoJSON feature; ``row`` of the manifest, open ``ring`` [n, 2] of lon, lat."""
-    ring = ring if _area(ring) > 0 else ring[::-1]  # counter-clockwise
+    x, y = ring.T
+    if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) <= 0:
+        ring = ring[::-1]  # counter-clockwise
     corners = [[round(float(v), 8) for v in point] for point in (*ring, ring[0])]
     values = {name: row[name] or None for name in TEXTS}
     values["right_offset_px"] = int(row["right_offset_px"])
@@ -320,11 +322,6 @@ def feature(row: Mapping[str, Any], ring: NDArray[np.float64]) -> dict[str, Any]
         "geometry": {"type": "Polygon", "coordinates": [corners]},
         "properties": values,
     }
-
-
-def _area(ring: NDArray[np.float64]) -> float:
-    x, y = ring.T
-    return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def write_footprints(folder: Path, features: Iterable[Mapping[str, Any]]) -> None:

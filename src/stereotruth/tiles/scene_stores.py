@@ -186,7 +186,9 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         scene=item.scene,
         left=left["image"],
         right=right["image"],
-        colours=_colours(left, right),
+        colours=tuple(tuple(view[name] for name in COLOURS) for view in (left, right))
+        if all(name in view for view in (left, right) for name in COLOURS)
+        else None,
         disparity=sure["disparity"],
         status=sure["status"],
         height=disparity["height"],
@@ -210,13 +212,6 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         doubts=() if notes is None else tuple(notes.warnings),
         remark="" if notes is None else notes.refinement.get("remark", ""),
     )
-
-
-def _colours(*views: zarr.Group) -> tuple[tuple[zarr.Array, ...], ...] | None:
-    """Red, green and blue of both images; None where they are grey."""
-    if not all(name in view for view in views for name in COLOURS):
-        return None
-    return tuple(tuple(view[name] for name in COLOURS) for view in views)
 
 
 # ------------------------------------------------------------------ windows

@@ -284,7 +284,10 @@ def _of_manifest(root: Path, sealed: Collection[str]) -> Iterator[Pair]:
                 f"no column {error}", file=root / "manifest.csv", remedy="make the dataset again"
             ) from None
         for file in filter(None, files):
-            _require(file, root / "manifest.csv")
+            if not file.is_file():
+                raise InputError(
+                    f"{file} is missing", file=root / "manifest.csv", remedy="complete the dataset"
+                )
         yield Pair(name, city, split, *files, row)
 
 
@@ -354,11 +357,6 @@ def _beside(left: Path, stem: str, folder: str | None) -> Path | None:
 
 def _partner(left: Path, name: str) -> InputError:
     return InputError(f"its partner {name} is missing", file=left, remedy="complete the dataset")
-
-
-def _require(file: Path, named_in: Path) -> None:
-    if not file.is_file():
-        raise InputError(f"{file} is missing", file=named_in, remedy="complete the dataset")
 
 
 def _split(root: Path, file: Path) -> str:
