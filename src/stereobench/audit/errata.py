@@ -53,6 +53,7 @@ from stereotruth.core.products.rasters import (
     write_tiff,
 )
 from stereotruth.tiles.manifest import disparity_cells, refuse_changed
+from stereotruth.tiles.quick_looks import NUMBERS, read_footprints, write_footprints
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from .estimates import SMALLEST_SCALE, cells, robust_fit, share
@@ -350,12 +351,19 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
         if (manifest := scratch / "manifest.csv").is_file():
             changed = {file.relative_to(dataset).as_posix() for file in found}
             rows = list(read_table(manifest))
-            for row in (row for row in rows if row.get("disp") in changed):
+            renewed = [row for row in rows if row.get("disp") in changed]
+            places = read_footprints(scratch) if renewed else {}
+            for row in renewed:
                 file = scratch / row["disp"]
                 cells = disparity_cells(read_disparity(file, none))
                 row |= {"disp_sha256": file_sha256(file)}
                 row |= {name: cell for name, cell in cells.items() if name in row}
+                if place := places.get(row.get("tile", "")):
+                    numbers = {name: float(cells[name]) for name in NUMBERS if cells[name]}
+                    place["properties"] |= dict.fromkeys(NUMBERS) | numbers
             write_table(manifest, rows)
+            if places:
+                write_footprints(scratch, places.values())
     log.info("%s: labels of %s corrected", out, in_number(len(found), "pair"))
     return len(found)
 

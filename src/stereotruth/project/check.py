@@ -38,7 +38,7 @@ def chosen(
 ) -> dict[str, Scene]:
     """The scenes that names of scenes or cities stand for; all without names.
 
-    Raises InputError for a name that neither sheet has.
+    Raises InputError for a name that neither sheet has, and if there is none.
     """
     names, cities = list(names), set(cities)
     unknown = [name for name in names if name not in scenes and name not in cities]
@@ -47,11 +47,16 @@ def chosen(
         raise InputError(
             f"no scene or city {unknown[0]!r}", file=rows, remedy=f"take of these: {known}"
         )
-    return {
+    found = {
         name: scene
         for name, scene in scenes.items()
         if not names or name in names or scene.city in names
     }
+    if not found:
+        raise InputError(
+            "no scene in it", file=rows, remedy="stereotruth scene add DELIVERY --lidar FOLDER"
+        )
+    return found
 
 
 def check_project(
@@ -75,15 +80,9 @@ def check_project(
         return [project]
     with project.of("sheets"):
         cities, every_scene = read_scenes(settings)
-        rows = sheet(settings, "scenes")
         images = read_images(settings, cities)
         check_fixed(settings, every_scene, images)
-        found = chosen(names, every_scene, cities, rows)
-        if not found:
-            raise InputError(
-                "no scene in it", file=rows, remedy="stereotruth scene add DELIVERY --lidar FOLDER"
-            )
-        scenes = found
+        scenes = chosen(names, every_scene, cities, sheet(settings, "scenes"))
         towns = len({scene.city for scene in scenes.values()})
         count = f"{in_number(len(scenes), 'scene')} of {towns} {'city' if towns == 1 else 'cities'}"
         project.fact("sheets", count)

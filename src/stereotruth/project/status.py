@@ -23,6 +23,7 @@ from ..core.products.files import read_json
 from ..evaluate.report.index_page import PAGES
 from ..tiles.label_moves import moves, sample_labels, worst_point
 from ..tiles.manifest import read_manifest
+from .check import chosen
 from .findings import heard, plain_table, wide
 from .project import configured, read_scenes, require_scenes, sheet
 from .run_workflow import arguments_for
@@ -177,24 +178,15 @@ def _made(city: str) -> str:
 
 
 def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list[CityStatus]:
-    """The status of cities, all of the sheet if none is named. Raises InputError for others."""
+    """The status of cities, or of those of scenes; all of the sheet if none is named.
+
+    Raises InputError for a name that no sheet has.
+    """
     require_scenes(configfiles)
     settings, _ = configured(configfiles)
     known, scenes = read_scenes(settings)
-    with_scenes = [city for city in known if any(s.city == city for s in scenes.values())]
-    if unknown := [city for city in cities if city not in known]:
-        raise InputError(
-            f"no city {unknown[0]!r}",
-            file=sheet(settings, "cities"),
-            remedy=f"take one of {', '.join(known)}",
-        )
-    wanted = list(cities) or with_scenes
-    if not wanted:
-        raise InputError(
-            "no scene in it",
-            file=sheet(settings, "scenes"),
-            remedy="stereotruth scene add DELIVERY --lidar FOLDER",
-        )
+    found = chosen(cities, scenes, known, sheet(settings, "scenes"))
+    wanted = [city for city in known if any(scene.city == city for scene in found.values())]
     of_city = "tiles/{0}", "results/report/{0}/index.html"
     targets = [target.format(city) for city in wanted for target in of_city]
     jobs = plan([*targets, "evaluate"], configfiles)

@@ -27,8 +27,8 @@ def defects(folder: str | Path) -> list[str]:
     """What differs from the manifest: ``missing``, ``changed`` or ``not in the manifest`` files.
 
     ``export.json`` keeps its own digest, and those of the manifest and the footprints. Works on
-    ``tiles/<City>`` and on ``dataset``. Files of other programs (:func:`foreign_files`) are no
-    defects. Raises InputError if there is no manifest.
+    ``tiles/<City>`` and on ``dataset``. Files of other programs are no defects. Raises InputError
+    if there is no manifest.
     """
     folder = Path(folder)
     found = []
@@ -44,7 +44,7 @@ def defects(folder: str | Path) -> list[str]:
     present = {
         p.relative_to(folder).as_posix()
         for p in files
-        if not p.name.startswith(".") and not _is_foreign(p)
+        if not p.name.startswith(".") and (p.name == STYLE or not is_foreign(p.name))
     }
     found += [
         f"{name}: not in the manifest"
@@ -66,22 +66,11 @@ def defects(folder: str | Path) -> list[str]:
     return found
 
 
-def _is_foreign(path: Path) -> bool:
-    return path.name != STYLE and is_foreign(path.name)
-
-
-def foreign_files(folder: str | Path) -> list[str]:
-    """Files that other programs have left in a folder of tiles, as paths in it, sorted."""
-    folder = Path(folder)
-    files = (p for p in folder.rglob("*") if p.is_file() and _is_foreign(p))
-    return sorted(p.relative_to(folder).as_posix() for p in files)
-
-
 def verify(folders: Iterable[str | Path]) -> dict[str, int]:
     """Check folders; the number of files that the manifest of each lists.
 
-    Files of other programs are named in the log and left alone. Raises InputError, after all were
-    looked at, naming the files that do not agree.
+    Files of other programs are left alone. Raises InputError, after all were looked at, naming the
+    files that do not agree.
     """
     counts, bad = {}, []
     for folder in map(Path, folders):
@@ -90,12 +79,6 @@ def verify(folders: Iterable[str | Path]) -> dict[str, int]:
         for line in found:
             log.error("%s/%s", folder, line)
         counts[str(folder)] = count = len(listed_files(folder))
-        if foreign := foreign_files(folder):
-            more = f" and {len(foreign) - 5} more" if len(foreign) > 5 else ""
-            log.info(
-                "%s: files of other programs, left alone: %s%s",
-                *(folder, ", ".join(foreign[:5]), more),
-            )
         if not found:
             log.info("%s: %d files as in the manifest", folder, count)
     if bad:

@@ -189,6 +189,9 @@ def test_a_download_is_copied_with_its_labels_corrected(download, tmp_path):
     root, file = download
     row = {"disp": "test/disp/KM_disparity_1.tiff", "disp_sha256": file_sha256(file)}
     row |= {"labelled_share": "0.981481", "disparity_min_px": "3.2500", "quality": "ok"}
+    row |= {"tile": "KM_1"}
+    place = {"id": "KM_1", "properties": {"disparity_min_px": 3.25, "split": "test"}}
+    (root / "footprints.geojson").write_text(json.dumps({"features": [place]}))
     write_table(root / "manifest.csv", [row])
     before = file.read_bytes()
     mask = np.zeros((6, 9), np.uint8)
@@ -208,6 +211,8 @@ def test_a_download_is_copied_with_its_labels_corrected(download, tmp_path):
         "labelled_share": f"{52 / 54:.6f}",
         "disparity_min_px": "5.0000",
     }
+    (place,) = json.loads((out / "footprints.geojson").read_text())["features"]
+    assert place["properties"]["disparity_min_px"] == 5.0 and place["properties"]["split"] == "test"
 
 
 def test_kitti_files_stay_such(tmp_path):
