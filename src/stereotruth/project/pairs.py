@@ -141,14 +141,6 @@ def _growing(pairs: Sequence[RatedPair], each: int | None, most: int) -> _Select
     return selection
 
 
-def roughness_of(city: str, settings: Configuration) -> float | None:
-    """Roughness of a city by the points that its scenes have ingested, m; None without any."""
-    _, scenes, _ = read_rows(settings)
-    folders = [INGESTED / city / name for name, scene in scenes.items() if scene.city == city]
-    stores = [PointStore(path) for folder in folders for path in sorted(folder.glob("*.points"))]
-    return roughness_m(stores) if stores else None
-
-
 def rated_pairs(
     city: str, settings: Configuration, roughness: float | None = None
 ) -> list[RatedPair]:
@@ -262,7 +254,9 @@ def list_pairs(
 ) -> Listing:
     """All pairs of a site. ``choice`` is written to the scenes sheet; None: nothing is."""
     settings, _ = configured(configfiles)
-    roughness = roughness_of(city, settings)
+    of_city = (name for name, scene in read_rows(settings)[1].items() if scene.city == city)
+    files = [file for name in of_city for file in sorted((INGESTED / city / name).glob("*.points"))]
+    roughness = roughness_m([PointStore(file) for file in files]) if files else None
     rated = rated_pairs(city, settings, roughness)
     lines = [_in_words(city, roughness)]
     if choice is not None:
