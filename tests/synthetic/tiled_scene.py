@@ -14,12 +14,12 @@ import rasterio
 
 from stereotruth.core.config.configuration import Export, Limits
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
-from stereotruth.core.sheets import City
 from stereotruth.epipolar.fit import fit_epipolar
 from stereotruth.epipolar.model import COLOURS, EpipolarModel
 from stereotruth.sensor.rpc import RPC, SensorModel
 from stereotruth.tiles.export import Extras, export_city
 from stereotruth.tiles.scene_stores import SceneFiles
+from stereotruth.tiles.tile_files import City
 
 SIZE = 64
 PIXELS = 360  # side of the original images

@@ -8,12 +8,12 @@ from stereotruth.align.alignment import Alignment
 from stereotruth.core.config.configuration import Export
 from stereotruth.core.products.files import atomic_file, read_json
 from stereotruth.core.products.making import rule_job
-from stereotruth.core.sheets import City
 from stereotruth.tiles.export import Extras, export_city
 from stereotruth.tiles.label_moves import edit_lines, keep_samples, since_last_run
 from stereotruth.tiles.manifest import read_manifest
 from stereotruth.tiles.scene_stores import SceneFiles
 from stereotruth.tiles.tile_checks import misfit_lines, summary_lines
+from stereotruth.tiles.tile_files import City
 
 if __name__ == "__main__":
     given, city = snakemake.input, snakemake.params.city

@@ -95,11 +95,6 @@ class City:
     the day of the images of its first scene that tell one, or else 2020.0. Control points without a
     frame of their own are of this epoch. See docs/explanation/frames.md"""
 
-    @property
-    def split_counts(self) -> dict[str, int]:
-        """Weights by split, to which the tiles that there are are scaled."""
-        return {"train": self.training, "val": self.validation, "test": self.testing}
-
 
 @dataclass(frozen=True, config=CHECKED)
 class Scene:

@@ -33,7 +33,6 @@ from ..core.errors import InputError
 from ..core.job import progress
 from ..core.products.files import atomic_file, atomic_folder, growing_table, write_table
 from ..core.products.provenance import describe, file_sha256, own_digest, source_digest
-from ..core.sheets import City
 from .label_doubts import Doubt, doubts, flag, missed
 from .manifest import FOOTPRINTS, NONE, STATUS_COLOURS_FILE, column
 from .orientation import save
@@ -64,7 +63,7 @@ from .tile_checks import (
     sigma_by_surface,
     summarise,
 )
-from .tile_files import FILES, RIGHT_FILES, Cut, write_tile
+from .tile_files import FILES, RIGHT_FILES, City, Cut, write_tile
 
 log = logging.getLogger("stereotruth")
 

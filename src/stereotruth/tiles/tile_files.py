@@ -18,7 +18,6 @@ from ..core.products.files import link
 from ..core.products.provenance import digest, file_sha256
 from ..core.products.rasters import write_tiff
 from ..core.products.resumable_grids import Ledger
-from ..core.sheets import City
 from ..epipolar.intersection import intersect
 from ..epipolar.warping import agreement, warp_rows
 from .label_surfaces import Buildings, heights_above_ground, label_surfaces
@@ -40,6 +39,25 @@ def round_disparity(disparity: NDArray[np.floating], dtype: str) -> NDArray[np.f
     if dtype == "float16":
         return disparity.astype(np.float16).astype(np.float32)
     return (np.rint(disparity * STEPS) / STEPS).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class City:
+    """A name, the prefix of its tiles, and tiles of table 3 by split.
+
+    As in the cities sheet, whose reader no code digest may hold.
+    """
+
+    city: str
+    prefix: str
+    training: int
+    validation: int
+    testing: int
+
+    @property
+    def split_counts(self) -> dict[str, int]:
+        """Tiles by split, which are scaled to the tiles there are."""
+        return {"train": self.training, "val": self.validation, "test": self.testing}
 
 
 @dataclass(frozen=True, eq=False)
