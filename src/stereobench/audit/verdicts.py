@@ -33,7 +33,7 @@ WRONG = 0.25  # share of wrong labels among those of one frequent value
 NEGLIGIBLE = 1e-3  # share of labels outside the range
 MIN_GREY_VALUES = 8  # of an image
 CHECKS = {  # what is wrong with a pair that fails, in the order of the page
-    "files": "files do not fit together",
+    "files": "files do not fit together, or are not those of the manifest",
     "rows": "rows do not correspond",
     "convention": "sign or sides are not as stated",
     "bias": "labels are offset",
