@@ -45,7 +45,7 @@ def label_pair(
     the images; ``columns``: others of the scenes sheet, as ``lidar_crs`` or ``geoid``. All stages
     are those of a run; they write to ``folder``, a project whose ``config.yaml`` holds, and the
     same call there carries on where a run has ended. Without a folder all is made in a temporary
-    one, and the dataset is in memory. ``cores``: all without it. Lines of the run are printed as
+    one, and the dataset is in memory. ``cores``: all without it. Lines of the run are shown as
     they come.
 
     Of each pixel [y, x]: ``disparity`` (px), ``height`` (m), ``status``, ``uncertainty`` (px) and
@@ -91,7 +91,7 @@ def _run(folder: Path, target: str, cores: int | None) -> None:
         text=True,
     ) as run:
         for line in filter(str.strip, run.stdout or ()):
-            print(line, end="", flush=True)
+            print(line, end="", file=sys.stderr, flush=True)
             lines.append(line.rstrip())
     if run.returncode:
         told = dict.fromkeys(line for line in lines if "error:" in line) or lines[-SAID:]
