@@ -54,11 +54,11 @@ first-city:
 	rm -rf .venv/first && PATH="$(CURDIR)/$(BIN):$$PATH" && stereotruth init .venv/first --example demo && \
 	  cd .venv/first && stereotruth run tiles/Demo --cores $(CORES) --quiet && cd ../.. && rm -rf .venv/first
 
-# Kernels of a run of the smallest city and of its page, compiled apart from those of .venv.
+# Kernels of the check and a run of the smallest city and of its page, compiled apart from those of .venv.
 wheel: $(READY)
 	rm -rf build dist
 	export NUMBA_CACHE_DIR="$(CURDIR)/build/cache" PATH="$(CURDIR)/$(BIN):$$PATH" && \
-	  stereotruth init build/first --example demo && (cd build/first && stereotruth run tiles/Demo report --cores $(CORES) --quiet)
+	  stereotruth init build/first --example demo && (cd build/first && stereotruth check && stereotruth run tiles/Demo report --cores $(CORES) --quiet)
 	STEREOTRUTH_KERNELS=build/cache/kernels $(PIP) wheel --no-deps --no-build-isolation --wheel-dir dist .
 
 tiles/%: $(READY) FORCE

@@ -292,7 +292,7 @@ def check_point_errors(
     model: EpipolarModel, disparity: Any, points: ControlPoints
 ) -> CheckPointErrors:
     """Labels of a disparity grid [y, x] against the check points that both images see."""
-    both = np.flatnonzero(points.in_left & points.in_right)
+    both = np.flatnonzero(np.logical_and(*points.seen))
     x, y = model.left_to_epipolar(*points.left[both].T)
     x_right, y_right = model.right_to_epipolar(*points.right[both].T)
     label, inner = sample_labels(disparity, x, y)

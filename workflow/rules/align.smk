@@ -27,7 +27,7 @@ rule align:
         alone=lambda wildcards: wildcards.scene not in ADJUSTED,
         code=source_digest("stereotruth.align.align"),
     message:
-        "Aligning scene {wildcards.scene} to its ground control points"
+        "Aligning scene {wildcards.scene} by its ground control points, or by RPCs alone"
     script:
         "../scripts/align.py"
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from stereotruth.align.images import GivenImage, open_image
+from stereotruth.align.images import open_image
 from stereotruth.core.products.files import read_json
 from stereotruth.core.products.making import rule_job
 from stereotruth.evaluate.report.index_page import write_index
@@ -16,7 +16,7 @@ if __name__ == "__main__":
     city, given = snakemake.wildcards.city, snakemake.input
     with rule_job(snakemake, f"site {city}"):
         images = [
-            open_image(GivenImage.of(name, Path(file), *cells))[0]
+            open_image(name, Path(file), *cells)[0]
             for name, (file, *cells) in snakemake.params.images.items()
         ]
         write_site_page(

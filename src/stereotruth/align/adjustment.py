@@ -5,19 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.statistics import TUKEY, robust_sigma, tukey_weights
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
 from .alignment import Alignment, over_the_image, parameters_of
 from .records import Equations, PairEquations
 from .tie_points import Geometry, TiePoints
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-
 
 MATCHING = 0.01  # px, what even the best match may be off
 LEAST_SIGMA = 1e-4  # of observations, in units of their own deviation
@@ -102,7 +98,7 @@ def root_of(covariance: Floats) -> Floats:
     return vectors[:, keep] * np.sqrt(values[keep])
 
 
-def _site_sigma(residuals: Floats, weights: Floats, sites: NDArray[np.int64], s: float) -> float:
+def _site_sigma(residuals: Floats, weights: Floats, sites: Ints, s: float) -> float:
     """Standard deviation that the places of a site share, from the scatter of the sites' means."""
     total = np.bincount(sites, weights)
     full = total > 1.0

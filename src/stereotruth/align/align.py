@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Bools, Floats
 from ..core.products.files import write_table
-from ..core.products.provenance import describe, source_digest
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..sensor.rpc import SensorModel
 from .alignment import (
@@ -36,7 +35,6 @@ from .alignment import (
 )
 from .control_points import ControlPoints, read_gcps
 from .gcp_checks import (
-    BLUNDER_FLOOR,
     MINIMAL,
     System,
     View,
@@ -54,8 +52,6 @@ from .gcp_checks import (
 from .images import open_view
 
 log = logging.getLogger("stereotruth")
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 
 POOR_SIGMA = 2.0  # px
@@ -161,7 +157,6 @@ def align(
     names: tuple[str, str] | None = None,
     model: str = "affine",
     scene: str = "",
-    seed: int = 0,
     strict: bool = False,
     epoch: Epoch = DEFAULT_EPOCH,
     provenance: Mapping[str, Any] | None = None,
@@ -172,9 +167,8 @@ def align(
     A GCP is left out of a view if its studentised residual exceeds
     :data:`.gcp_checks.BLUNDER_FLOOR` px and 4.5 times the GCPs' robust deviation; up to a third of
     a view's GCPs. ``names`` of both images in the images sheet are what control points of the long
-    form name. ``seed`` is for the samples among more than 23 GCPs. ``epoch``: of the city's places,
-    see :func:`.control_points.read_gcps`. The result does not depend on the order of the GCPs.
-    ``strict`` makes warnings errors.
+    form name. ``epoch``: of the city's places, see :func:`.control_points.read_gcps`. The result
+    does not depend on the order of the GCPs. ``strict`` makes warnings errors.
 
     Raises InputError, naming scene, file and remedy: unreadable input, GCPs outside the images or
     elsewhere on the Earth, left and right swapped, too few or collinear GCPs for the model (naming
@@ -190,7 +184,7 @@ def align(
     opened = [open_view(n, image, of) for n, image in zip(("left", "right"), images)]
     sensors = opened[0][0], opened[1][0]
     try:
-        fits, doubts = _fit_views(points, images, opened, model, seed)
+        fits, doubts = _fit_views(points, images, opened, model)
     except InputError as error:
         file = error.file or points.file
         raise type(error)(error.problem + of, file=file, remedy=error.remedy) from None
@@ -204,11 +198,6 @@ def align(
             remedy="correct the GCPs, or set strict to false",
         )
     heights = {g.id: g.height for fit in fits for g in fit.gcps if g.used}
-    if provenance is None:
-        settings = {"model": model, "blunder_floor_px": BLUNDER_FLOOR}
-        provenance = describe(
-            [points.file, *images], settings, source_digest("stereotruth.align.align")
-        )
     return Alignment(
         scene=scene,
         model=model,
@@ -218,7 +207,7 @@ def align(
         right_fit=fits[1],
         reference_height=round(float(np.mean([heights[name] for name in sorted(heights)])), 3),
         warnings=tuple(doubts),
-        provenance=dict(provenance),
+        provenance=dict(provenance or {}),
     )
 
 
@@ -227,7 +216,6 @@ def _fit_views(
     images: tuple[Path, Path],
     opened: Sequence[tuple[SensorModel, tuple[int, int]]],
     model: str,
-    seed: int,
 ) -> tuple[list[ViewFit], list[str]]:
     """The fits of both views, and doubts about the points. What is refused does not name the scene
     yet."""
@@ -253,7 +241,7 @@ def _fit_views(
         check_frame(points, replace(view, index=np.flatnonzero(seen), measured=measured[seen]))
         refuse_fit(model, view, points, np.ones(len(index), dtype=bool))
         system = System.of(model, view.predicted, view.measured)
-        trials.append(_Trial(view, system, *find_blunders(system, floor=BLUNDER_FLOOR, seed=seed)))
+        trials.append(_Trial(view, system, *find_blunders(system)))
     if points.frame and points.frame["source"]["legs"]:
         legs = "; ".join(points.frame["source"]["legs"])
         log.info("GCPs of frame %s brought to ITRF2020: %s", points.frame["source"]["frame"], legs)
@@ -319,10 +307,6 @@ def from_rpcs(
         fits.append(replace(fit, covariance=rpc_prior(fit)))
         sensors.append(sensor)
     log.warning("warning: %s", PLACES_BY_RPCS)
-    if provenance is None:
-        provenance = describe(
-            [left_image, right_image], {"model": model}, source_digest("stereotruth.align.align")
-        )
     return Alignment(
         scene=scene,
         model=model,
@@ -332,7 +316,7 @@ def from_rpcs(
         right_fit=fits[1],
         reference_height=round(float(np.mean([s.rpc.height_off for s in sensors])), 3),
         warnings=(PLACES_BY_RPCS,),
-        provenance=dict(provenance),
+        provenance=dict(provenance or {}),
     )
 
 

@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.products.files import atomic_file, read_perhaps_edited, read_record, sealed
 from ..sensor.rpc import LineCorrection, SensorModel
 
 log = logging.getLogger("stereotruth")
-
-Floats = NDArray[np.float64]
 
 
 RPC_SHIFT = 10.0  # px, standard deviation of what an RPC without control points is off, and

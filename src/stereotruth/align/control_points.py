@@ -1,17 +1,11 @@
 """Reading of control and check points: ground coordinates with their measured image positions.
 
-A CSV of the columns ``id,lon,lat,height,left_col,left_row,right_col,right_row``: WGS 84 longitude
-and latitude in degrees, ellipsoidal height in m, and (col, row) in px of each original image, pixel
-(0, 0) being the centre of the upper-left pixel. Both cells of a view are empty where it does not
-see the point.
-
-Lines that begin with ``#`` are remarks. ``# frame: EPSG:6318`` names the geographic system of
-the ground coordinates where this is not WGS 84, ``# epoch: 2016.4`` their epoch where the frame is
-dynamic, or WGS 84 (ITRF) at another date than that of the images. Points are brought to ITRF2020 at
-the epoch of the city's images (:mod:`stereotruth.lidar.frames`).
-
-Or the long form, one line per point and image, which serves all pairs of a site: ``id,lon,lat,
-height,image,col,row``, ``image`` being a name of the images sheet.
+A CSV of the columns ``id,lon,lat,height,left_col,left_row,right_col,right_row``: WGS 84 degrees,
+ellipsoidal height in m, and (col, row) in px of each original image, both empty where a view does
+not see the point. Or the long form, one line per point and image of a site: ``id,lon,lat,height,
+image,col,row``, ``image`` being a name of the images sheet. Lines that begin with ``#`` are
+remarks; ``# frame:`` and ``# epoch:`` say what the ground coordinates are where they are not WGS 84
+at the date of the images (docs/explanation/frames.md).
 """
 
 from __future__ import annotations
@@ -21,18 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import continuous
 from ..core.products.files import of_text
 from ..core.tables import Table, decimal_number, epoch_year
 from ..lidar.frames import DEFAULT_EPOCH, Epoch, frame_change, taken_as_it_is
-
-Floats = NDArray[np.float64]
-
 
 COLUMNS = ("id", "lon", "lat", "height", "left_col", "left_row", "right_col", "right_row")
 LONG = ("id", "lon", "lat", "height", "image", "col", "row")  # one line per point and image
@@ -71,14 +62,9 @@ class ControlPoints:
     remarks: tuple[str, ...] = ()
 
     @property
-    def in_left(self) -> NDArray[np.bool_]:
-        """bool[n]: measured in the left image."""
-        return np.isfinite(self.left[:, 0])
-
-    @property
-    def in_right(self) -> NDArray[np.bool_]:
-        """bool[n]: measured in the right image."""
-        return np.isfinite(self.right[:, 0])
+    def seen(self) -> tuple[Bools, Bools]:
+        """bool[n] each: measured in the left, in the right image."""
+        return np.isfinite(self.left[:, 0]), np.isfinite(self.right[:, 0])
 
 
 def read_gcps(
@@ -110,21 +96,21 @@ def _read(file: Path, images: tuple[str, str] | None, epoch: Epoch) -> ControlPo
     points: dict[str, tuple[int, list[float]]] = {}
     for line, cells in rows:
         name = of_text(cells["id"])
-        if not name:
-            raise InputError(
-                f"line {line}: the id is empty", remedy="give every point an id of its own"
-            )
         if name in points:
             raise InputError(
                 f"lines {points[name][0]} and {line} both have the id {name!r}",
                 remedy="give every point an id of its own",
             )
-        if len(name) > LONGEST_ID or not name.isprintable():
+        if not name or len(name) > LONGEST_ID or not name.isprintable():
             raise InputError(
-                f"line {line}: the id {name[:20]!a} … of {len(name)} characters is no name",
+                f"line {line}: the id {name[:20]!a} of {len(name)} characters is no name",
                 remedy=f"give ids of at most {LONGEST_ID} characters that can be printed",
             )
-        points[name] = line, _values(name, line, cells)
+        values = [_number(cells[column]) for column in COLUMNS[1:]]
+        if defect := _defect_of(cells, values):
+            problem, remedy = defect
+            raise InputError(f"line {line}, point {name}: {problem}", remedy=remedy)
+        points[name] = line, values
     if not points:
         raise InputError(
             "there are no points in the file", remedy="add one line per point under the header"
@@ -274,49 +260,36 @@ def _table(file: Path) -> Table:
     return table
 
 
-def _values(name: str, line: int, cells: dict[str, str]) -> list[float]:
-    """The seven numbers of a point, checked; NaN for empty image coordinates."""
-    values = []
-    for column in COLUMNS[1:]:
-        text = cells[column]
-        if not text and column not in COLUMNS[1:4]:
-            values.append(np.nan)
-            continue
-        try:
-            number = decimal_number(text)
-        except ValueError:
-            number = np.nan
-        if not np.isfinite(number):
-            what = "is empty" if not text else f"{text[:40]!r} is no number"
-            raise InputError(
-                f"line {line}, point {name}: {column} {what}", remedy="write a decimal number"
-            )
-        values.append(number)
+def _number(text: str) -> float:
+    """The number in a cell; NaN where there is none."""
+    try:
+        return decimal_number(text)
+    except ValueError:
+        return np.nan
+
+
+def _defect_of(cells: dict[str, str], values: list[float]) -> tuple[str, str] | None:
+    """What is wrong with the seven numbers of a point, and the remedy."""
+    for column, value in zip(COLUMNS[1:], values):
+        if not np.isfinite(value) and (cells[column] or column in COLUMNS[1:4]):
+            what = f"{cells[column][:40]!r} is no number" if cells[column] else "is empty"
+            return f"{column} {what}", "write a decimal number"
     lon, lat, height, *image = values
     if abs(lat) > 90 or not -180 <= lon <= 360:
-        where = f"line {line}, point {name}: lon {lon:g}, lat {lat:g}"
         if abs(lon) <= 90 and abs(lat) <= 360:
-            raise InputError(
-                f"{where}: lon and lat seem to be swapped", remedy="exchange the two columns"
-            )
-        raise InputError(
-            f"{where} are no degrees",
-            remedy="give WGS 84 longitude and latitude in degrees, not projected coordinates",
-        )
+            return f"lon {lon:g} and lat {lat:g} seem to be swapped", "exchange the two columns"
+        remedy = "give WGS 84 longitude and latitude in degrees, not projected coordinates"
+        return f"lon {lon:g}, lat {lat:g} are no degrees", remedy
     if not HEIGHT_RANGE[0] <= height <= HEIGHT_RANGE[1]:
-        raise InputError(
-            f"line {line}, point {name}: a height of {height:g} m is not of this Earth",
-            remedy="give ellipsoidal heights in metres",
+        return (
+            f"a height of {height:g} m is not of this Earth",
+            "give ellipsoidal heights in metres",
         )
     for view, pair in (("left", image[:2]), ("right", image[2:])):
-        if np.isnan(pair[0]) != np.isnan(pair[1]):
-            raise InputError(
-                f"line {line}, point {name}: only one of {view}_col, {view}_row is given",
-                remedy="give both, or leave both empty where the image does not show the point",
-            )
+        if np.isnan(pair).sum() == 1:
+            remedy = "give both, or leave both empty where the image does not show the point"
+            return f"only one of {view}_col, {view}_row is given", remedy
     if np.isnan(image).all():
-        raise InputError(
-            f"line {line}, point {name} is measured in neither image",
-            remedy="give its position in at least one image, or remove it",
-        )
-    return values
+        remedy = "give its position in at least one image, or remove it"
+        return "it is measured in neither image", remedy
+    return None

@@ -1,11 +1,9 @@
 """Doubts and remarks in words: the LiDAR's heights, images of a site, why labels are less sure.
 
-A fault of the vertical datum (geoid left out or added twice, feet for metres, another zero) moves
-the LiDAR along the vertical, which the images see as a shift of both, each along its own line of
-sight. Three witnesses can tell it: the heights of the control points; the tie points, against what
-the alignment's uncertainty allows; and without control points the RPCs, whose errors have no
-reason to look like a fault of heights. Nothing else in the data can: with a pair of RPCs that are
-off by an unknown amount, a common vertical shift is a change of both images like any other.
+A fault of the vertical datum moves the LiDAR along the vertical, which the images see as a shift of
+both, each along its own line of sight. Three witnesses tell it: the heights of the control points;
+the tie points, against what the alignment's uncertainty allows; and without control points the
+RPCs, whose errors have no reason to look like a fault of heights (docs/planted_errors.md).
 """
 
 from __future__ import annotations
@@ -15,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, ndtri, stdtrit
 
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import metres_per_degree
 from ..core.numerics.statistics import robust_sigma
 from ..lidar.lattice import PER_M
@@ -28,10 +26,6 @@ from .align import CAREFUL_SIGMA
 from .alignment import Alignment, GcpResidual
 from .line_fit import LineFit
 from .shared_errors import SharedErrors, plan_slopes
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-
 
 LIDAR_SIGMA_M = 0.15  # m, vertical: what airborne surveys promise against their control
 LIDAR_PLAN_M = 0.3  # m, of east and of north: what they promise in plan
@@ -95,9 +89,7 @@ def heights_of_model(
     return (round(low - margin, 3), round(high + margin, 3)) if low <= high else None
 
 
-def _heights_around(
-    stores: Sequence[PointStore], gcp: GcpResidual, reach_m: float
-) -> NDArray[np.float64]:
+def _heights_around(stores: Sequence[PointStore], gcp: GcpResidual, reach_m: float) -> Floats:
     """Heights m of the points within ``reach_m`` of a control point, or of the AROUND nearest.
 
     None where there are fewer within WIDEST_M.
@@ -111,16 +103,6 @@ def _heights_around(
     if distance.size < AROUND:
         return np.empty(0)
     return height[distance <= max(reach_m, np.partition(distance, AROUND - 1)[AROUND - 1])]
-
-
-def pixel_m(alignment: Alignment) -> float:
-    """Size of a pixel of the left image on the ground, m."""
-    cols, rows = alignment.left_fit.size
-    ends = [
-        np.array(alignment.left.localize(cols / 2 + step, rows / 2, alignment.reference_height))
-        for step in (-0.5, 0.5)
-    ]
-    return float(np.hypot(*(ends[1] - ends[0]) * metres_per_degree(ends[0][1])))
 
 
 def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float) -> str:

@@ -10,14 +10,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.products.files import read_table
 from ..core.products.rasters import image_shape, read_overview
 from ..pages.pictures import DIFFERENCES, round_length, save_figure, stretch
 from .alignment import Alignment, ViewFit
 
-Floats = NDArray[np.float64]
 NAMES = ("disparity of LiDAR − that of the images", "y-parallax")
 PICTURE_PX = 1024  # of the left image
 
@@ -87,13 +86,13 @@ class _Ties(NamedTuple):
     the epipolar grid, px; residuals (disparity, y-parallax) ``before``, ``after`` and
     ``by_affines`` alone [n, 2], px; which are ``used`` [n]."""
 
-    site: NDArray[np.int64]
+    site: Ints
     left: Floats
     at: Floats
     before: Floats
     after: Floats
     by_affines: Floats
-    used: NDArray[np.bool_]
+    used: Bools
 
     @classmethod
     def read(cls, csv_file: str | Path) -> _Ties | None:

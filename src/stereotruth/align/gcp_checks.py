@@ -1,11 +1,10 @@
 """Which ground control points are blunders, and what is refused of them before and after the fit.
 
-Robust least squares of small corrections in image space: affine, similarity or shift. Blunders are
-found by least trimmed squares over all minimal samples (Rousseeuw & Van Driessen 2006, "Computing
-LTS regression for large data sets"), then by studentised residuals; the result is the exact
-least-squares solution (by ``cv2.solve``) on the other points. ``cv2.estimateAffine2D``, the paper's
-way, draws random samples and refines its result only in part, so that it depends on the order of
-the points. What is refused names the remedy, and the file if it is not that of the points.
+Blunders are found by least trimmed squares over all minimal samples (Rousseeuw & Van Driessen 2006,
+"Computing LTS regression for large data sets"), then by studentised residuals. The result is the
+exact least-squares solution (``cv2.solve``) on the other points. ``cv2.estimateAffine2D``, the
+paper's way, depends on the order of the points. What is refused names the remedy, and the file if
+it is not that of the points.
 """
 
 from __future__ import annotations
@@ -21,14 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, in_number
+from ..core.numerics.arrays import Bools, Floats
 from ..sensor.pair_geometry import GroundOfImages
 from ..sensor.rpc import SensorModel
 from ..sensor.rpc_files import rpc_file
 from .control_points import ControlPoints, TooFewPoints
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-
 
 MINIMAL = {"affine": 3, "similarity": 2, "shift": 1}  # points that determine the model
 BLUNDER_FLOOR = 1.25  # px: 5 sigma of a careful measurement (0.25 px)
@@ -115,7 +111,7 @@ class System:
         return np.column_stack([np.eye(2) + linear, shift])
 
 
-def trimmed(system: System, seed: int) -> Bools:
+def trimmed(system: System) -> Bools:
     """The half of the points (and a little more) that agree best: least trimmed squares.
 
     Each minimal sample starts concentration steps: fit, keep the h points that fit best, repeat.
@@ -129,7 +125,7 @@ def trimmed(system: System, seed: int) -> Bools:
     if math.comb(n, k) <= MAX_SAMPLES:
         samples = np.array(list(itertools.combinations(range(n), k)))
     else:
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         samples = np.array([rng.choice(n, k, replace=False) for _ in range(MAX_SAMPLES)])
     kept = np.zeros((len(samples), n))
     np.put_along_axis(kept, samples, 1.0, axis=1)
@@ -168,18 +164,18 @@ def studentised(system: System, used: Bools) -> Floats:
     return lengths / np.sqrt(np.maximum(variance, 1e-6))
 
 
-def find_blunders(system: System, *, floor: float, seed: int) -> tuple[Bools, Floats, float]:
+def find_blunders(system: System) -> tuple[Bools, Floats, float]:
     """Which points are used, the studentised residuals [n] in px, and the threshold in px."""
     n = len(system.delta)
     if n <= system.minimal + 1:  # nothing to tell a blunder from the others
         used = np.ones(n, dtype=bool)
         return used, np.zeros(n), np.inf
-    used = trimmed(system, seed)
+    used = trimmed(system)
     for _ in range(30):
         lengths = studentised(system, used)
         sigma = float(np.median(lengths)) / RAYLEIGH_MEDIAN
         # Wider for few points, whose deviation is not well known (as Student's t is).
-        threshold = (1 + 1 / (n - system.minimal)) * max(floor, BLUNDER_SIGMAS * sigma)
+        threshold = (1 + 1 / (n - system.minimal)) * max(BLUNDER_FLOOR, BLUNDER_SIGMAS * sigma)
         again = lengths <= threshold
         if again.sum() <= system.minimal or (again == used).all():
             break
@@ -278,9 +274,8 @@ def check_ground(points: ControlPoints, boxes: Sequence[Floats], images: Sequenc
     """
     inside = [_in_box(box, points.lon, points.lat) for box in boxes]
     near = np.any(inside, axis=0)
-    measured = points.in_left, points.in_right
     shares = [
-        float(np.mean(here[seen])) if seen.any() else 1.0 for here, seen in zip(inside, measured)
+        float(np.mean(here[seen])) if seen.any() else 1.0 for here, seen in zip(inside, points.seen)
     ]
     if min(shares) == 0.0 and max(shares) > 0.5:
         wrong = int(np.argmin(shares))
@@ -333,7 +328,7 @@ def misfits_of_sides(
     Median distance from the median shift, the worse of both images; NaN of fewer than three GCPs
     (``near`` [n], default all) that both images show.
     """
-    both = points.in_left & points.in_right
+    both = np.logical_and(*points.seen)
     both = both if near is None else both & near
     if both.sum() < 3:
         return np.nan, np.nan

@@ -1,27 +1,24 @@
 """Images of a pair or a site, opened; the ground of a pair by their RPCs, and sites all over it.
 
-The ground of a pair is that whose LiDAR can have a say in its products. It is known before LiDAR is
-read and before anything is aligned: by the RPCs, with what they may be off and with the heights
-that they are made for. Labels follow from points that the pair's epipolar grid shows, and from
-points on the rays from there to both cameras; heights of an original image from what its frame
-shows. Whether the LiDAR that was read is enough is asked again with the aligned images.
+The ground of a pair is that whose LiDAR can have a say in its products, by the RPCs with what they
+may be off and the heights that they are made for: labels follow from points that the pair's
+epipolar grid shows, and on the rays from there to both cameras; heights of an original image from
+what its frame shows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 from rasterio.errors import RasterioError
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import corners_of_hull, metres_per_degree, turn
 from ..core.products.rasters import open_raster
 from ..core.tables import acquisition_time
@@ -34,7 +31,6 @@ from ..sensor.rpc_files import read_rpc, rpc_file
 from ..sensor.site_pairs import SiteImage
 from .alignment import RPC_SHIFT, RPC_TILT
 
-Floats = NDArray[np.float64]
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 Site = tuple[int, int, float, float]  # upper-left col, row px; lowest, highest point in m
 
@@ -48,6 +44,7 @@ MOST_DEGREES = 10.0  # along a side of a footprint: more is none of one site
 SITES = 120  # about; each is read by itself
 SITE = 168  # px of the left image, side of a site
 MARGIN = 24  # px around a site whose points are looked at
+NEAR_DEG = 1e-5  # around a place whose cells tell the heights of its points
 NOT_FIRM = (3, 4, 5, 9)  # ASPRS classes: vegetation, and water, which moves
 IS_FIRM = ~np.isin(np.arange(256), NOT_FIRM)  # by class
 PIXEL_M = (0.01, 1000.0)  # m on the ground
@@ -148,35 +145,21 @@ def _blindness(sensor: SensorModel, size: tuple[int, int]) -> str:
     return ""
 
 
-@dataclass(frozen=True)
-class GivenImage:
-    """What the images sheet says: ``acquired`` and ``sun`` (azimuth, elevation) may be None."""
-
-    name: str
-    file: Path
-    acquired: date | datetime | None
-    sun: tuple[float, float] | None
-
-    @classmethod
-    def of(
-        cls, name: str, file: Path, acquired: str, azimuth: float | None, elevation: float | None
-    ) -> GivenImage:
-        """From the cells of a row, which have been checked."""
-        sun = None if azimuth is None or elevation is None else (float(azimuth), float(elevation))
-        return cls(name, file, acquisition_time(acquired) if acquired else None, sun)
-
-
-def open_image(given: GivenImage) -> tuple[SiteImage, Acquisition]:
+def open_image(
+    name: str, file: Path, acquired: str, azimuth: float | None, elevation: float | None
+) -> tuple[SiteImage, Acquisition]:
     """An image and what its delivery says of it. InputError if it or its RPC cannot be used.
 
-    What the sheet says goes before the delivery.
+    What the images sheet says goes before the delivery: the checked cells of the day or time
+    (empty: nothing) and of the sun's angles, degrees.
     """
-    sensor, size = open_view(f"site's {given.name}", given.file, "")
-    rpc = sensor.rpc
-    place = float(rpc.long_off), float(rpc.lat_off)
-    delivery = read_acquisition(given.file, place)
-    taken = by_sheet(delivery, given.acquired, given.sun, place)
-    return SiteImage(given.name, sensor, size, taken.time, taken.sun), delivery
+    sensor, size = open_view(f"site's {name}", file, "")
+    place = float(sensor.rpc.long_off), float(sensor.rpc.lat_off)
+    delivery = read_acquisition(file, place)
+    time = acquisition_time(acquired) if acquired else None
+    sun = None if azimuth is None or elevation is None else (float(azimuth), float(elevation))
+    taken = by_sheet(delivery, time, sun, place)
+    return SiteImage(name, sensor, size, taken.time, taken.sun), delivery
 
 
 def footprint_of(
@@ -204,13 +187,23 @@ def pair_outlines(left: SensorModel, right: SensorModel, sizes: Sizes) -> list[F
 
     Raises InputError if the images share no ground.
     """
-    low, high = _heights(left, right)
+    boxes = np.array([sensor.rpc.ground_box[4:] for sensor in (left, right)])
+    low, high = float(boxes[:, 0].min()), float(boxes[:, 1].max())
+    margin = HEIGHT_SHARE * (high - low)
+    low, high = low - margin, high + margin
     middle = (low + high) / 2
     overlap = find_overlap(left, right, sizes, middle, (low, high), ("left", "right"))
     turn = find_rotation(left, right, overlap, middle)[0][:, :2]
-    heights = steps(low, high, LEVELS, 0.0)
     wide = DEVIATIONS * (RPC_SHIFT + RPC_TILT * max(*sizes[0], *sizes[1]))
-    col, row = turn.T @ _rim(*_grid(left, right, sizes, turn, heights, wide))
+    # The pair's grid, in turned px of the left image: what its frame shares with the right one at
+    # any of the heights, as in :func:`.fit._grid`, wider by what the RPCs may be off.
+    heights = steps(low, high, LEVELS, 0.0)[None, :]
+    lon, lat = right.localize(*(axis[:, None] for axis in frame(sizes[1], EDGE)), heights)
+    seen = np.stack(left.project(lon, lat, heights)).reshape(2, -1)
+    frames = turn @ np.stack(frame(sizes[0], 2)), turn @ seen[:, np.isfinite(seen).all(axis=0)]
+    first = np.maximum(*(each.min(axis=1) for each in frames)) - wide
+    last = np.minimum(*(each.max(axis=1) for each in frames)) + wide
+    col, row = turn.T @ _rim(first, last)
     grid = []
     for height, other in ((low, high), (high, low)):
         lon, lat = left.localize(col, row, height)
@@ -220,36 +213,6 @@ def pair_outlines(left: SensorModel, right: SensorModel, sizes: Sizes) -> list[F
         rim = _rim(np.full(2, -wide), np.array(size) - 1 + wide)
         outlines.append(_hull([sensor.localize(*rim, height) for height in (low, high)]))
     return outlines
-
-
-def _heights(left: SensorModel, right: SensorModel) -> tuple[float, float]:
-    """Ellipsoidal heights (m) between which the ground of a pair lies."""
-    boxes = np.array([sensor.rpc.ground_box[4:] for sensor in (left, right)])
-    low, high = float(boxes[:, 0].min()), float(boxes[:, 1].max())
-    margin = HEIGHT_SHARE * (high - low)
-    return low - margin, high + margin
-
-
-def _grid(
-    left: SensorModel,
-    right: SensorModel,
-    sizes: Sizes,
-    turn: Floats,
-    heights: Floats,
-    wide: float,
-) -> tuple[Floats, Floats]:
-    """Lowest and highest corner [2] of the pair's epipolar grid, in turned px of the left image.
-
-    What the left frame shares with the right one at any of the heights, as in :func:`.fit._grid`,
-    widened by ``wide`` px for what the RPCs may be off.
-    """
-    col, row = frame(sizes[1], EDGE)
-    lon, lat = right.localize(col[:, None], row[:, None], heights[None, :])
-    seen = np.stack(left.project(lon, lat, heights[None, :])).reshape(2, -1)
-    frames = turn @ np.stack(frame(sizes[0], 2)), turn @ seen[:, np.isfinite(seen).all(axis=0)]
-    low = np.maximum(*(each.min(axis=1) for each in frames)) - wide
-    high = np.minimum(*(each.max(axis=1) for each in frames)) + wide
-    return low, high
 
 
 def _rim(low: Floats, high: Floats) -> Floats:
@@ -269,53 +232,10 @@ def _hull(places: Sequence[tuple[Floats, Floats]]) -> Floats:
     return ground[:, corners_of_hull(*ground)]
 
 
-def _heights_of_points(
-    stores: Sequence[PointStore], lon: float, lat: float, reach: float
-) -> tuple[float, float] | None:
-    """Lowest and highest point (m) of the cells around a place; None where there are none."""
-    box = lon - reach, lat - reach, lon + reach, lat + reach
-    found = [
-        store.height_range(*box)
-        for store in stores
-        if store.bounds[0] <= box[2]
-        and store.bounds[2] >= box[0]
-        and store.bounds[1] <= box[3]
-        and store.bounds[3] >= box[1]
-    ]
-    found = [pair for pair in found if pair is not None]
-    return (min(p[0] for p in found), max(p[1] for p in found)) if found else None
-
-
-def _covered(
-    left: SensorModel,
-    right: SensorModel,
-    right_size: tuple[int, int],
-    stores: Sequence[PointStore],
-    height: float,
-    col: float,
-    row: float,
-) -> tuple[float, float] | None:
-    """Range of heights (m) at a left position that LiDAR and right image cover, else None.
-
-    ``height``: about that of the ground.
-    """
-    low = high = height
-    for _ in range(3):
-        lon, lat = (float(v) for v in left.localize(col, row, (low + high) / 2))
-        if not np.isfinite(lon):
-            return None
-        there = _heights_of_points(stores, lon, lat, 1e-5)
-        if there is None:
-            return None
-        low, high = there
-    c, r = right.project(lon, lat, (low + high) / 2)
-    return (low, high) if 0 <= c < right_size[0] and 0 <= r < right_size[1] else None
-
-
 def choose_sites(
     left: SensorModel,
     right: SensorModel,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
+    sizes: Sizes,
     stores: Sequence[PointStore],
     height: float,
 ) -> list[Site]:
@@ -329,12 +249,26 @@ def choose_sites(
     if min(cols, rows) < SITE:
         return []
 
+    def covered(col: float, row: float) -> tuple[float, float] | None:
+        """Range of heights at a left position that LiDAR and right image cover."""
+        low = high = height
+        for _ in range(3):
+            lon, lat = (float(v) for v in left.localize(col, row, (low + high) / 2))
+            if not np.isfinite(lon):
+                return None
+            box = lon - NEAR_DEG, lat - NEAR_DEG, lon + NEAR_DEG, lat + NEAR_DEG
+            there = [pair for store in stores if (pair := store.height_range(*box))]
+            if not there:
+                return None
+            low, high = min(pair[0] for pair in there), max(pair[1] for pair in there)
+        c, r = right.project(lon, lat, (low + high) / 2)
+        return (low, high) if 0 <= c < sizes[1][0] and 0 <= r < sizes[1][1] else None
+
     def grid(spacing: float) -> list[Site]:
         found = []
         for row in np.arange(spacing / 2, rows, spacing):
             for col in np.arange(spacing / 2, cols, spacing):
-                heights = _covered(left, right, sizes[1], stores, height, col, row)
-                if heights is not None:
+                if (heights := covered(col, row)) is not None:
                     corner = (
                         min(max(int(at) - SITE // 2, 0), n - SITE)
                         for at, n in zip((col, row), (cols, rows))
@@ -349,12 +283,11 @@ def choose_sites(
 def query_box(left: SensorModel, right: SensorModel, site: Site) -> Floats | None:
     """(west, south, east, north) of all points that either image may show in a site, degrees."""
     col0, row0, low, high = site
-    corner_cols, corner_rows = (
-        c.ravel() for c in np.meshgrid([-MARGIN, SITE + MARGIN], [-MARGIN, SITE + MARGIN])
-    )
+    ends = np.array([-MARGIN, SITE + MARGIN])
+    corners = [axis.ravel() for axis in np.meshgrid(col0 + ends, row0 + ends)]
     middle = (low + high) / 2
-    ground = [left.localize(col0 + corner_cols, row0 + corner_rows, z) for z in (low, high)]
-    at_right = right.project(*left.localize(col0 + corner_cols, row0 + corner_rows, middle), middle)
+    ground = [left.localize(*corners, z) for z in (low, high)]
+    at_right = right.project(*left.localize(*corners, middle), middle)
     ground += [right.localize(*at_right, z) for z in (low, high)]
     ground = np.hstack([np.stack(g) for g in ground])
     if not np.isfinite(ground).all():

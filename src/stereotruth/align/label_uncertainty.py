@@ -1,25 +1,12 @@
 """What the uncertainty of an alignment means for labels: of their disparity at a fixed pixel.
 
-An alignment that is off moves a label twice. With e_d the error of a ground point's disparity, and
-(e_x, e_y) that of its place in the grid of the labelled view, what was at x + e is what the pixel x
-is said to show. So the label at a pixel is off by
+With e_d the error of a ground point's disparity, (e_x, e_y) that of its place in the grid of the
+labelled view, and s the slope of the disparity, the label at a pixel is off by e_d - s_x e_x -
+s_y e_y. These have causes in common, so that their covariance is kept, on nodes over the grid. Why,
+and why errors of the other image's rows have no part: docs/explanation/uncertainty.md.
 
-    e_d - s_x e_x - s_y e_y,
-
-s being the slope of the disparity along x and y. The errors have causes in common: the labelled
-image's correction moves place and disparity alike. Its variance therefore needs the covariance of
-all three, not their standard deviations alone.
-
-The epipolar grids are made from the same corrections. So a ground point whose rows the alignment
-gets wrong in the right image only keeps its left pixel and its disparity: its label is right, and
-the right image shows it in another row. That is y-parallax, an error of the images and not of the
-labels; e_y is that of the labelled view alone.
-
-Strips of the LiDAR that disagree are another error. A point that is off by o = (east, north, up)
-lies off in the grid of the labelled view, and its disparity is off, by e = J o. Images are aligned
-to all strips together, so that labels of a strip are off by e less what the alignment takes of it
-(:func:`_taken`). This is known of each strip; its square is part of the labels' variance, with the
-variance of the offset itself.
+A strip of the LiDAR that is off by o = (east, north, up) moves its labels by J o, less what the
+alignment takes of all strips together (:func:`_taken`).
 """
 
 from __future__ import annotations
@@ -28,9 +15,10 @@ import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core.kernels import inner, kernel
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import exact_metres_per_degree
 from ..core.numerics.interpolation import between_four
 from ..epipolar.model import EpipolarModel
@@ -38,9 +26,6 @@ from ..lidar.lattice import CELL_BITS, LATTICE_DEG, cell_key
 from ..lidar.point_store import SQUARES
 from ..lidar.strips import StripOffsets
 from .alignment import Alignment
-
-Floats = NDArray[np.float64]
-
 
 STEP = 64  # px between the nodes; variances are quadratic in between, and at most too large there
 _UPPER = np.triu_indices(3)  # (d, d), (d, x), (d, y), (x, x), (x, y), (y, y)
@@ -57,15 +42,10 @@ def label_covariance(
     left or right. For points at the reference height; NaN where the model has no ground.
     """
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-    height = model.reference_height
-    if view == "left":
-        left = np.stack(model.epipolar_to_left(x, y), axis=-1)
-        ground = model.left.localize(left[..., 0], left[..., 1], height)
-        right = np.stack(model.right.project(*ground, height), axis=-1)
-    else:
-        right = np.stack(model.epipolar_to_right(x, y), axis=-1)
-        ground = model.right.localize(right[..., 0], right[..., 1], height)
-        left = np.stack(model.left.project(*ground, height), axis=-1)
+    place, ground = _ground(model, x, y, view)
+    other = model.right if view == "left" else model.left
+    there = np.stack(other.project(*ground, model.reference_height), axis=-1)
+    left, right = (place, there) if view == "left" else (there, place)
     slopes = [
         image.slopes(at[..., 0], at[..., 1])
         for image, at in zip((model.left_image, model.right_image), (left, right))
@@ -219,7 +199,7 @@ def with_strips(
         return uncertainty
     rows, cols = (STEP * np.arange(-(-(n - 1) // STEP) + 1) for n in model.shape)
     x, y = (a.astype(np.float64) for a in np.meshgrid(cols, rows))
-    ground = _ground(model, x, y, view)
+    ground = _ground(model, x, y, view)[1]
     shares = _shares(strips, *ground)
     known = shares.sum(axis=0) > 0
     if not known.any():
@@ -241,7 +221,7 @@ def with_strips(
     return replace(uncertainty, nodes=uncertainty.nodes + nodes, step=STEP)
 
 
-def _taken(effects: Floats, x: Floats, y: Floats, known: NDArray[np.bool_]) -> Floats:
+def _taken(effects: Floats, x: Floats, y: Floats, known: Bools) -> Floats:
     """What an alignment takes of ``effects`` [rows, cols, 3] at places: the affine function that
     fits those of disparity best, and the mean of those of place.
 
@@ -254,12 +234,15 @@ def _taken(effects: Floats, x: Floats, y: Floats, known: NDArray[np.bool_]) -> F
     return taken
 
 
-def _ground(model: EpipolarModel, x: Floats, y: Floats, view: str) -> tuple[Floats, Floats]:
-    """Longitude and latitude (degrees) of places of a view's grid, at the reference height."""
-    height = model.reference_height
-    if view == "left":
-        return model.left.localize(*model.epipolar_to_left(x, y), height)
-    return model.right.localize(*model.epipolar_to_right(x, y), height)
+def _ground(
+    model: EpipolarModel, x: Floats, y: Floats, view: str
+) -> tuple[Floats, tuple[Floats, Floats]]:
+    """Where the image has places of a view's grid [..., 2] px; longitude and latitude (degrees) of
+    the ground there, at the reference height."""
+    is_left = view == "left"
+    place = model.epipolar_to_left(x, y) if is_left else model.epipolar_to_right(x, y)
+    sensor = model.left if is_left else model.right
+    return np.stack(place, axis=-1), sensor.localize(*place, model.reference_height)
 
 
 def _shares(strips: StripOffsets, lon: Floats, lat: Floats) -> Floats:

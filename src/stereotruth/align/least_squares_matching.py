@@ -8,16 +8,12 @@ pixels lie. The slopes are the mean of both windows', so that noise draws nothin
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Floats, Singles
 from ..core.numerics.interpolation import SIX_POINT_RADIUS, six_point_weights
 from ..core.numerics.statistics import TUKEY, biweight, robust_sigma
 from ..epipolar.resampling import sample
-
-Floats = NDArray[np.float64]
-Picture = NDArray[np.float32]
-
 
 ITERATIONS = 20
 CONVERGED = 0.003  # px
@@ -102,7 +98,7 @@ def _shift(
 
 @kernel
 def warp_patch(
-    source: Picture, col: float, row: float, carry: Floats, scale: tuple[float, float], out: Picture
+    source: Singles, col: float, row: float, carry: Floats, scale: tuple[float, float], out: Singles
 ) -> None:
     """Fill ``out`` [h, w] by the source at (col, row) + carry · (columns, rows from the pixel
     [h // 2, w // 2]), by cubic convolution."""
@@ -123,7 +119,7 @@ def warp_patch(
 
 
 @inner
-def _inner(picture: Picture, window: Floats) -> None:
+def _inner(picture: Singles, window: Floats) -> None:
     """Fill a window [n, 3] by the values and slopes of a picture inside its margin of one px."""
     k = 0
     for j in range(1, picture.shape[0] - 1):
@@ -217,9 +213,9 @@ def _discord(
 
 @kernel
 def least_squares_match(
-    template: Picture,
+    template: Singles,
     clear: Floats,
-    source: Picture,
+    source: Singles,
     col: float,
     row: float,
     carry: Floats,

@@ -1,15 +1,10 @@
 """Corrections by line of both images of a pair, from what an affine leaves at the tie points.
 
-Roll and pitch that swing while an image is taken move its lines. By how much, and how smoothly, the
-tie points themselves say: each image's two functions of the line are Gaussian processes, whose
-standard deviations (along the lines and across) and length are those of the greatest marginal
-likelihood, beside errors of the matches and errors that the places of a site share. They have no
-mean and no trend over the lines, which are the affine's. On level ground tie points see the
-difference of both images alone; what both have in common is seen on slopes, and stays uncertain by
-as much as the process says.
-
-The corrections are used if the likelihood rises by more than chance allows, and if those of one
-half of the sites fit the tie points of the other half better than none.
+Each image's two functions of the line (roll, pitch) are Gaussian processes, whose standard
+deviations and length are those of the greatest marginal likelihood, beside errors of matches and
+sites. They have no mean and no trend over the lines, which are the affine's. They are used if the
+likelihood rises by more than chance allows, and if one half of the sites fits the other better with
+them. See docs/explanation/refinement.md.
 """
 
 from __future__ import annotations
@@ -21,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtr
 
+from ..core.numerics.arrays import Floats
 from ..core.numerics.statistics import TUKEY, huber_weights, robust_sigma, tukey_weights
 from ..sensor.rpc import LineCorrection, line_weights
 from .adjustment import (
@@ -35,9 +31,6 @@ from .adjustment import (
 )
 from .records import Equations
 from .shared_errors import WIDEST, Steps, amount, climb
-
-Floats = NDArray[np.float64]
-
 
 CELLS = 40  # of a spline over the lines: four a period where an image has ten
 LENGTHS = (1 / 32, 1 / 23, 1 / 16, 1 / 11, 1 / 8, 1 / 5.6, 1 / 4)  # of a process, in images
@@ -311,12 +304,6 @@ def posterior_covariance(normal: Floats, variances: Floats) -> Floats:
     return root[:, None] * np.linalg.inv(inner) * root
 
 
-def _freedom(covariance: Floats, variances: Floats) -> float:
-    """How many unknowns [p] a prior of ``variances`` leaves, by their posterior covariance."""
-    known = variances > 0.0
-    return float(known.sum() - np.sum(np.diag(covariance)[known] / variances[known]))
-
-
 def fit_lines(
     equations: Equations,
     affine_root: Floats,
@@ -359,11 +346,13 @@ def fit_lines(
     # Of the lines where the affines are known, whose own uncertainty is that of the estimate: what
     # both share is known better than either.
     beside = posterior_covariance(sums.sharing(amount(steps[2]))[0][own, own], variances[own])
+    known = variances[own] > 0.0
+    freedom = known.sum() - np.sum(np.diag(beside)[known] / variances[own][known])
     noise = float(np.sqrt(found.noise))
     return LineFit(
         np.round(lines, 6).ravel(),  # so that the count of threads leaves no trace
         affine_root @ found.mean[:affine],
-        _freedom(beside, variances[own]),
+        float(freedom),
         rows,
         covariance_at_lines(
             beside * found.noise * unit**2 * halves.spread, root, equations.lines, rows

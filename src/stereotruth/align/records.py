@@ -9,15 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.statistics import median_and_nmad
 from ..core.products.files import atomic_file, read_record, sealed
 from ..sensor.rpc import LineCorrection, SensorModel, read_correction
 from .alignment import Alignment, ViewFit, gcp_of, over_the_image
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 
 MEANING = (
     "observed [along, across the epipolar rows; px] = design [2, 12] @ parameters + error, one row "
@@ -44,7 +41,7 @@ class Equations:
     design: Floats
     observed: Floats
     own: Floats
-    site: NDArray[np.int64]
+    site: Ints
     at: Floats
     there: Floats
 
@@ -97,11 +94,23 @@ class PairEquations:
     in_plan: tuple[PlanObservation, ...] = ()
 
 
-def spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:
-    """Figures of one component [n] in px; the trend is that of a plane over the left image.
+def spreads_of(
+    before: Floats, after: Floats, at: Floats, size: tuple[int, int]
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Figures of residuals [n, 2] px of disparity and y-parallax ``before`` and ``after``.
 
-    ``at`` [n, 2] px in the left image of ``size`` (cols, rows).
+    ``at`` [n, 2] px in the left image of ``size`` (cols, rows), over which a trend is a plane.
     """
+    return {
+        word: {
+            name: _spread_of(values[:, k], at, size)
+            for k, name in enumerate(("disparity", "y_parallax"))
+        }
+        for word, values in (("before", before), ("after", after))
+    }
+
+
+def _spread_of(values: Floats, at: Floats, size: tuple[int, int]) -> dict[str, float]:
     median, nmad = median_and_nmad(values)
     middle, half = np.array(size) / 2, max(size) / 2
     design = np.column_stack([(at - middle) / half, np.ones(len(values))])
@@ -281,21 +290,13 @@ def _refinement(site: Mapping[str, Any], scene: ScenePair) -> dict[str, Any]:
     corrections = {k: one for k, of in enumerate(figures) if (one := read_correction(of))}
     by_line = SiteLines(corrections, {}).effect(equations.design, equations.lines, (0, 1))
     size = tuple(site["images"][scene.left]["size"])
-    spreads = {}
-    for word, parameters, lines in (
-        ("before", ties.start, 0.0),
-        ("after", np.concatenate(images), by_line),
-    ):
-        values = equations.observed - equations.design @ parameters - lines
-        spreads[word] = {
-            name: spread_of(values[:, k], equations.at, size)
-            for k, name in enumerate(("disparity", "y_parallax"))
-        }
+    before = equations.about(ties.start).observed
+    after = equations.about(np.concatenate(images)).observed - by_line
     return record | {
         "tie_points": len(equations.own),
         "used": used,
         "sites": int(np.unique(equations.site).size),
-        **spreads,
+        **spreads_of(before, after, equations.at, size),
         "meaning": "px of the epipolar grid at the tie points: disparity of LiDAR minus that of "
         "the images, and y-parallax; before: by control points or RPCs, after: by the adjustment "
         "of all images of the site",

@@ -1,19 +1,11 @@
 """Automatic refinement of an alignment: what is left between LiDAR and the two images is removed.
 
-GCPs of 0.25 px leave 0.1 to 0.25 px of y-parallax and of difference between the disparities of
-LiDAR and images. Hundreds of tie points (:mod:`.tie_points`) see this relative error directly. What
-both images have in common they see on slopes only, as LiDAR strips are co-registered by their
-heights: to 0.05 to 0.3 px on the synthetic cities, even in the plains. So the twelve parameters of
-both affines are estimated together, the GCP fits and their covariance being the prior: tie points
-settle the relative part, and the rest as far as they see it. Where that leaves the place in plan
-open, edges of roofs settle it (:mod:`.shared_errors`).
-
-The adjustment starts from what most tie points agree on, and blunders (moved or built since,
-vegetation, water, repetition) get no weight (Tukey's biweight). Neighbouring matches share errors,
-by an amount that is estimated from the scatter between sites. All share one, that is estimated
-from how much good and poor matches differ. The alignment is left exactly as it is if neither tie
-points nor roofs contradict it, or if the corrections from one half of the sites do not improve the
-other half.
+Tie points (:mod:`.tie_points`) see how both images are off against each other and, on slopes,
+against the LiDAR. The twelve parameters of both affines are estimated from them together, with the
+fits to the control points as the prior (:mod:`.adjustment`), corrections by line (:mod:`.line_fit`)
+and the place in plan by edges of roofs (:mod:`.shared_errors`). The alignment is left exactly as it
+is if nothing contradicts it, or if one half of the sites does not improve the other. How, and how
+well: docs/explanation/refinement.md.
 """
 
 from __future__ import annotations
@@ -25,14 +17,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.config.configuration import Rectify
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
+from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.statistics import robust_sigma
 from ..core.products.files import write_table
 from ..lidar.point_store import PointStore, open_stores
 from ..sensor.images import Source, open_pair
+from ..sensor.pair_geometry import pixel_deg
 from .adjustment import (
     LEAST_SIGMA,
     Estimate,
@@ -56,19 +50,17 @@ from .doubts import (
     height_by_images,
     height_by_rpcs,
     heights_of_model,
-    pixel_m,
     remark_of,
     scatter_by_heights,
 )
 from .images import choose_sites
 from .line_fit import UNKNOWNS as LINE_UNKNOWNS
 from .line_fit import LineFit, estimate_with_lines, line_design
-from .records import Equations, spread_of
+from .records import Equations, spreads_of
 from .shared_errors import SharedErrors, place_pair, with_shared_errors
 from .tie_points import Geometry, common_shift, find_places, match
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 
 
 FINE = 6  # px: radius of the first search around every place
@@ -108,14 +100,7 @@ def _record(
     """JSON-ready figures of a refinement; ``reason`` why it was not applied, or empty."""
     observations, found, refined = result.observations, result.estimate, result.alignment
     used, ties = observations.used, observations.ties
-    size = alignment.left_fit.size
-    spreads = {
-        word: {
-            name: spread_of(values[used, k], ties.left[used], size)
-            for k, name in enumerate(("disparity", "y_parallax"))
-        }
-        for word, values in (("before", observations.before), ("after", observations.after))
-    }
+    states = observations.before[used], observations.after[used]
     return {
         "applied": not reason,
         "reason": reason,
@@ -128,7 +113,7 @@ def _record(
         "deviation_over_that_of_the_match": found.ratio.round(3).tolist(),
         "shared_in_a_site": found.site_ratio.round(3).tolist(),
         "sigma_shared_by_all_px": found.shared.round(4).tolist(),
-        **spreads,
+        **spreads_of(*states, ties.left[used], alignment.left_fit.size),
         "change_of_left": _changes(alignment.left_fit, refined.left_fit.affine),
         "change_of_right": _changes(alignment.right_fit, refined.right_fit.affine),
         "meaning": "px of the epipolar grid at the tie points used: disparity of LiDAR minus that "
@@ -311,10 +296,10 @@ def _widening(
     if scatter <= explained:
         return ratio
     doubts.append(
-        f"tie points scatter by {scatter:.2f} px of disparity, where the matches and the heights "
-        f"of a LiDAR explain {explained:.2f} px: without ground control points the images may have "
-        "been placed on other ground; check that the RPCs belong to the images, which may have "
-        "been cut since"
+        f"tie points scatter by {scatter:.3f} px of disparity, where the matches and the heights "
+        f"of a LiDAR explain {explained:.3f} px at most: without ground control points the images "
+        "may have been placed on other ground; check that the RPCs belong to the images, which may "
+        "have been cut since"
     )
     return max(ratio, (scatter / explained) ** 2)
 
@@ -358,10 +343,9 @@ def refine(
         prior = prior_of(alignment)
         gcps = control_points_of(alignment)
         sensors = alignment.left, alignment.right
-        doubts = [
-            doubt_at_gcps(gcps, stores, pixel_m(alignment)) if gcps else "",
-            doubt_by_rpcs(stores, sensors),
-        ]
+        middle = [n / 2 for n in alignment.left_fit.size]
+        pixel = pixel_deg(alignment.left, *middle, alignment.reference_height)[1] * DEGREE_M
+        doubts = [doubt_at_gcps(gcps, stores, pixel), doubt_by_rpcs(stores, sensors)]
         doubts = [text for text in doubts if text]
         alignment = replace(alignment, model_heights=heights_of_model(stores, sensors))
         result = _search(alignment, (left, right), stores, prior)

@@ -1,15 +1,10 @@
 """Edges of roofs: where the LiDAR has them, and by how much an image shows them elsewhere.
 
-Such an edge stands in a fixed place over the ground, and an image shows it as a line. Level ground
-tells nothing of its own place; its roofs do. An edge is a straight line between a smooth roof and
-points that lie lower by STEP_M at least, along LENGTH_M. Crowns are no roofs: their points lie on
-no plane.
-
-Across each edge, the slopes of the grey values are looked at, as their median along the edge has
-them. Roofs have parapets, gutters and overhangs, and sunlit walls: an image has several lines
-beside each other, and which of them is the LiDAR's edge is not known. So every line has a say by
-its share of the contrast, and the offset is that at which most of them lie near the edges, within
-ROOF_RIM_M. Opposite edges tell how far points and lines lie inwards or outwards of each other.
+An edge is a straight line between the points of a smooth roof and points that lie lower by STEP_M,
+along LENGTH_M. Across it, an image has several lines (parapets, gutters, sunlit walls), each of
+which has a say by its share of the contrast: the offset is that at which most of them lie near the
+edges, within ROOF_RIM_M. Opposite edges tell how far points and lines lie inwards of each other.
+See docs/explanation/real_sensors.md.
 """
 
 from __future__ import annotations
@@ -17,19 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from ..core.numerics.geometry import metres_per_degree
 from ..core.numerics.statistics import TO_SIGMA
 from ..sensor.images import Source
 from ..sensor.rpc import SensorModel
 from .least_squares_matching import warp_patch
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
 
 STEP_M = 2.5  # m that a roof lies above what is beside it: more than cars, hedges and fences
 LENGTH_M, LENGTH_SPACINGS = 10.0, 10.0  # of an edge, at most: a wall of a house
@@ -72,7 +62,7 @@ class RoofEdges:
     end: Floats
     outward: Floats
     height: Floats
-    site: Integers
+    site: Ints
 
     def __len__(self) -> int:
         return self.site.size
@@ -315,7 +305,7 @@ class _Lines:
     """k lines beside edges: index int[k] of the ``edge``; ``offset`` px [k] along its normal;
     ``share`` [k] of the contrast of its edge."""
 
-    edge: Integers
+    edge: Ints
     offset: Floats
     share: Floats
 
@@ -383,7 +373,7 @@ def _estimate(
     return np.round(estimate, 6), normal, change * (weight * residual)[:, None]
 
 
-def _find_lines(source: Source, at: _Projected, sites: Integers, reach_m: float) -> _Lines:
+def _find_lines(source: Source, at: _Projected, sites: Ints, reach_m: float) -> _Lines:
     """Lines within ``reach_m`` of all edges; read site by site."""
     edge, offset, share = [], [], []
     for site in np.unique(sites):
@@ -408,7 +398,7 @@ def _find_lines(source: Source, at: _Projected, sites: Integers, reach_m: float)
 
 
 def _lines_across(
-    picture: NDArray[np.float32], start: Floats, end: Floats, normal: Floats, reach: float
+    picture: Singles, start: Floats, end: Floats, normal: Floats, reach: float
 ) -> tuple[Floats, Floats]:
     """Offsets px [k] along the ``normal`` at which lines along an edge stand out in a picture, and
     their contrast [k]; none where the picture does not show all of it."""

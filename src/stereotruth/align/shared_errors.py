@@ -1,16 +1,12 @@
 """Errors that tie points share, which their number does not average away.
 
-**Near each other.** Strips of the LiDAR that disagree, RPCs that an affine does not follow,
-attitude beyond what the lines tell: the residuals of sites near each other agree. Their covariance
-is that of the greatest restricted likelihood (Patterson & Thompson 1971), exponential in the
-distance, beside errors that each site has for itself. It counts if the likelihood rises by more
-than chance allows; then it is part of what labels state, and of how sure the corrections are.
+**Near each other.** Their covariance is that of the greatest restricted likelihood (Patterson &
+Thompson 1971), exponential in the distance, beside errors that each site has for itself
+(docs/explanation/uncertainty.md).
 
-**All of them, in plan.** Tie points bind images to each other. Of the place that all have in common
-they tell by slopes only, and what they tell is stated with twice the variance that their scatter
-shows: light and shade change with the slope, and so do errors of matches, in all of a scene alike.
-Edges of roofs enter as observations beside them (:mod:`.roof_edges`). All images look at the same
-roofs, so that they share COMMON_M of error.
+**All of them, in plan.** What tie points tell of the place that all images have in common is stated
+with twice its variance, and edges of roofs (:mod:`.roof_edges`) enter as observations beside them,
+with COMMON_M of error that all images share (docs/explanation/real_sensors.md).
 """
 
 from __future__ import annotations
@@ -21,10 +17,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import chdtrc
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.geometry import metres_per_degree
 from ..lidar.point_store import PointStore, query_points
 from ..sensor.images import Source
@@ -36,7 +32,6 @@ from .records import Equations, PlanObservation
 from .roof_edges import ROOF_RIM_M, PlanOffset, RoofEdges, find_roof_edges, plan_offset
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 
 
 CHANCE = 0.05  # probability of such a rise of the likelihood where sites share nothing
@@ -232,8 +227,8 @@ def _counted(
     found: Estimate,
     equations: Equations,
     shared: SharedErrors,
-    index: NDArray[np.int64],
-    known: NDArray[np.bool_],
+    index: Ints,
+    known: Bools,
     at: Floats,
 ) -> tuple[Estimate, SharedErrors]:
     """The estimate by generalised least squares, with the errors that are shared."""

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..sensor.rpc import RPC, LineCorrection, SensorModel, of_record, read_correction
 from .align import LARGE_SHIFT
@@ -32,7 +32,6 @@ from .site_fit import (
 )
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 
 
 WHAT = "corrections of the RPCs of a site's images, adjusted together"

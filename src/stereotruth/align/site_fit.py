@@ -1,18 +1,12 @@
 """One correction per image: the images of a site that share ground, adjusted together.
 
-Unknown are the affine corrections of all images. Three kinds of observations bear on them: the
-RPCs, which are off by :func:`.alignment.rpc_prior`; control points as measured in each image; and
-the tie points of each pair (:mod:`.refine`), which bind the errors of two images to each other and,
-on slopes, to the LiDAR. A pair enters as its normal equations, whose weights are those of its own
-robust estimate. Images that share no pair are bound through those between them.
-
-Control points that no correction fits get no weight (Tukey's biweight), and so do pairs whose tie
-points contradict those of the other pairs by more than their errors explain. The result does not
-depend on the order of images or pairs.
-
-Each pair tells by itself whether its lines are off (:mod:`.line_fit`). The images of pairs that do
-get one correction by line each, as Gaussian processes whose standard deviations and length are the
-medians of those pairs. An image that jitters shows it in all of its pairs, its partners in one.
+Observations are the RPCs, control points as measured in each image, the normal equations of each
+pair's tie points by its own robust estimate, and edges of roofs. Control points that fit no
+correction, and pairs that contradict the others, lose their weight (Tukey's biweight). The result
+does not depend on the order of images or pairs. The images of pairs whose lines are off
+(:mod:`.line_fit`) get one correction by line each, with the medians of those pairs' processes: an
+image that jitters shows it in all of its pairs, its partners in one. See
+docs/explanation/refinement.md.
 """
 
 from __future__ import annotations
@@ -21,9 +15,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.statistics import huber_weights, robust_sigma, tukey_weights
 from ..sensor.rpc import LineCorrection
 from .adjustment import FREE, MATCHING, Estimate, Sums, estimate
@@ -42,8 +36,6 @@ from .line_fit import (
 from .records import Equations, PairEquations, PlanObservation, SiteLines
 from .shared_errors import PlanFrame, shared_spread, with_offsets, with_shared_errors
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 STEPS = 60  # of the reweighting, at most
 SETTLED_PX = 1e-6  # change of a step after which no other follows
 FIRST_STEPS = 12  # with weights that leave nothing out: the start is not robust
@@ -96,7 +88,7 @@ def fit_site_lines(
         found[image] = LineCorrection((0.0, rows[image] - 1.0), np.round(values, 6))
     padded = np.pad(covariance, (0, 1))  # nothing is unknown of an image without a start
 
-    def own_unknowns(pair: PairOfLines) -> NDArray[np.int64]:
+    def own_unknowns(pair: PairOfLines) -> Ints:
         of_images = [start[k] + np.arange(2 * rank) if k in start else np.full(2 * rank, -1)
                      for k in pair.images]  # fmt: skip
         return np.concatenate(of_images)
@@ -123,7 +115,7 @@ def _of_pair(
     start: Mapping[int, int],
     count: int,
     known: SiteLines,
-) -> tuple[NDArray[np.int64], Floats, Floats]:
+) -> tuple[Ints, Floats, Floats]:
     """Which unknowns a pair tells of, its design [n, 2, p] of them and observations [n, 2], in
     standard deviations of its matches."""
     equations = pair.equations
@@ -239,7 +231,7 @@ class SiteFit:
         return self.covariance[np.ix_(index, index)]
 
 
-def _six(k: int) -> NDArray[np.int64]:
+def _six(k: int) -> Ints:
     return np.arange(6 * k, 6 * k + 6)
 
 
@@ -249,7 +241,7 @@ class _Points:
 
     design: Floats
     delta: Floats
-    index: NDArray[np.int64]
+    index: Ints
 
     @classmethod
     def of(cls, images: Sequence[ImageToFit], lines: SiteLines) -> _Points:
@@ -281,7 +273,7 @@ class _Pair:
     """A pair's normal equations; ``index`` [12] of its parameters among all."""
 
     scene: str
-    index: NDArray[np.int64]
+    index: Ints
     equations: Equations
     estimate: Estimate
     sums: Sums

@@ -1,14 +1,10 @@
 """One surface alone: planes through the points of a window, and the pixels that show nothing else.
 
-A tie point compares the two images over a window on a plane. Anything that stands beside the plane
-moves between the images by its parallax, and a dark crown over a bright lawn outweighs all of the
-lawn's texture. So the plane is fitted robustly, and a pixel takes part only if no point off the
-plane lies within a guard distance of it, as either image sees that point.
-
-The points are asked, and not the surface that labels follow from: of even ground that keeps one
-point for four pixels. With planes and clear pixels from its rasterised facets the disparities of
-six drawn scenes were off by 0.0118 px instead of 0.0105 px on the average, and an exact alignment
-counted as contradicted; with clear pixels alone by 0.0107 px.
+What stands beside the plane moves between the images by its parallax. So the plane is fitted
+robustly, and a pixel takes part only if no point off the plane lies within a guard distance of it,
+as either image sees that point (docs/explanation/refinement.md). The points are asked, and not the
+facets that labels follow from, which keep one point for four pixels of even ground: with these six
+drawn scenes were off by 0.0118 px instead of 0.0105 px on the average.
 """
 
 from __future__ import annotations
@@ -16,15 +12,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.kernels import inner, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.statistics import TUKEY, biweight, robust_sigma
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
 
 HALF = 10  # px: windows of 21 x 21
 SIDE = 2 * HALF + 1
@@ -71,8 +62,8 @@ class SitePoints(NamedTuple):
     row: Floats
     height: Floats
     firm: Bools
-    first: Integers
-    soft: Integers
+    first: Ints
+    soft: Ints
     heights: tuple[float, float]
     shape: tuple[int, int]
     parallax: Floats
@@ -95,13 +86,13 @@ class SitePoints(NamedTuple):
         soft = np.concatenate([[0], np.cumsum(~firm)])
         return cls(col, row, height, firm, first, soft, heights, shape, parallax)
 
-    def fit_planes(self, centres: Integers) -> tuple[Floats, Floats]:
+    def fit_planes(self, centres: Ints) -> tuple[Floats, Floats]:
         """Planes [k, 4] of windows around centres int[k, 2], and shares [k]: see the kernel."""
         planes, share = np.empty((len(centres), 4)), np.empty(len(centres))
         _fit_planes(self, centres, planes, share)
         return planes, share
 
-    def clear_pixels(self, centres: Integers, planes: Floats) -> Bools:
+    def clear_pixels(self, centres: Ints, planes: Floats) -> Bools:
         """Pixels [guards, k, SIDE, SIDE] of windows around ``centres`` int[k, 2] that show their
         ``planes`` [k, 4] alone, by each of GUARDS: see the kernel."""
         guards = np.array([(guard.px, guard.spacings) for guard in GUARDS])
@@ -112,7 +103,7 @@ class SitePoints(NamedTuple):
 
 
 @kernel
-def _by_pixel(col: Floats, row: Floats, height: Floats, cols: int, first: Integers) -> Integers:
+def _by_pixel(col: Floats, row: Floats, height: Floats, cols: int, first: Ints) -> Ints:
     """The points [n] of a box of so many ``cols`` by pixel, those of a pixel by height, equal ones
     as they come; without those outside.
 
@@ -201,7 +192,7 @@ def _robust_plane(u: Floats, v: Floats, h: Floats, plane: Floats) -> float:
 
 
 @kernel
-def _fit_planes(points: SitePoints, centres: Integers, planes: Floats, share: Floats) -> None:
+def _fit_planes(points: SitePoints, centres: Ints, planes: Floats, share: Floats) -> None:
     """Robust planes through the points of windows around ``centres`` int[k, 2] (col, row) px.
 
     Fills ``planes`` [k, 4]: height at the centre (m), slopes along columns and rows (m/px), robust
@@ -267,7 +258,7 @@ def _near(marked: Bools, j: int, i: int, radius: float) -> bool:
 
 
 @inner
-def _above(points: SitePoints, plane: Floats, centre: Integers, k: int) -> float:
+def _above(points: SitePoints, plane: Floats, centre: Ints, k: int) -> float:
     """Height m of a point above a plane."""
     col, row = points.col[k] - centre[0], points.row[k] - centre[1]
     return points.height[k] - plane[0] - plane[1] * col - plane[2] * row
@@ -277,7 +268,7 @@ def _above(points: SitePoints, plane: Floats, centre: Integers, k: int) -> float
 def _clear_pixels(
     points: SitePoints,
     guards: Floats,
-    centre: Integers,
+    centre: Ints,
     plane: Floats,
     clear: Bools,
 ) -> None:

@@ -1,14 +1,10 @@
 """Places where LiDAR and both images show one smooth surface, and by how much they disagree.
 
-The scene is sampled at a fixed number of sites, spread evenly over the ground that both images and
-the LiDAR cover, whatever its size. In a site, places are windows on a plane of the points, whose
-pixels take part if nothing but the plane is seen there (:mod:`.tie_planes`). The plane maps the
-left window to the right image, and robust least-squares matching finds by how much the right image
-shows the same elsewhere (:mod:`.least_squares_matching`): the tie point's shift.
-
-On a plane a right image position depends on the left one by ``carry``, so that the shift is, to
-first order, (error of the right image's model) − carry · (error of the left's): what both have in
-common is seen on slopes only.
+Places are windows on a plane of the points at sites all over the scene, whose pixels take part if
+nothing but the plane is seen there (:mod:`.tie_planes`). The plane maps the left window to the
+right image, and least-squares matching (:mod:`.least_squares_matching`) finds the shift that is
+left: with ``carry``, by which a right position depends on the left one, to first order (error of
+the right image's model) − carry · (error of the left's). See docs/explanation/refinement.md.
 """
 
 from __future__ import annotations
@@ -20,8 +16,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from ..core.numerics.interpolation import SIX_POINT_RADIUS
 from ..core.numerics.statistics import median_and_nmad, robust_sigma
 from ..epipolar.resampling import ANTIALIAS
@@ -31,12 +27,6 @@ from ..sensor.rpc import SensorModel
 from .images import IS_FIRM, MARGIN, SITE, Site, query_box
 from .least_squares_matching import least_squares_match, warp_patch
 from .tie_planes import GUARDS, HALF, MIN_POINTS, SIDE, Guard, SitePoints
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Integers = NDArray[np.int64]
-Picture = NDArray[np.float32]
-
 
 PER_SIDE = 3  # places per side of a site, at most
 STEP = 4  # px between the candidates for a place
@@ -58,7 +48,7 @@ class Places:
     ``clear`` [n, SIDE, SIDE]: pixels of the window that show the plane alone, by ``guard``.
     """
 
-    site: Integers
+    site: Ints
     lon: Floats
     lat: Floats
     height: Floats
@@ -70,7 +60,7 @@ class Places:
         return self.site.size
 
 
-def _shift_information(picture: Picture) -> tuple[Floats, Floats, Floats]:
+def _shift_information(picture: Singles) -> tuple[Floats, Floats, Floats]:
     """Information of each pixel [k, k] about a shift: products xx, xy, yy of its slopes, saturated.
 
     A pixel of the median slope of the picture counts a half, none more than one: texture is wanted,
@@ -89,23 +79,18 @@ def _smaller_eigenvalue(xx: Floats, xy: Floats, yy: Floats) -> Floats:
     return (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
 
 
-def _window_sums(values: Floats) -> Floats:
-    return cv2.boxFilter(values, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT)
-
-
 def _candidates(
-    information: tuple[Floats, Floats, Floats], share: Floats, at: Integers
-) -> tuple[Integers, Integers]:
+    information: tuple[Floats, Floats, Floats], share: Floats, at: Ints
+) -> tuple[Ints, Ints]:
     """Part of the site [n] and index [n] of the most promising windows, TRIED at most of each of
     PER_SIDE² parts.
 
     By the information of their pixels, and by the share of the points that lie on the plane.
     ``share`` [k, k] of the candidates at px ``at`` [k] along both axes, 0 where there is no plane.
     """
-    score = np.maximum(
-        _smaller_eigenvalue(*(_window_sums(np.nan_to_num(t)) for t in information)), 0.0
-    )
-    score = score[np.ix_(at, at)] * share**4
+    how = {"normalize": False, "borderType": cv2.BORDER_CONSTANT}
+    sums = (cv2.boxFilter(np.nan_to_num(t), -1, (SIDE, SIDE), **how) for t in information)
+    score = np.maximum(_smaller_eigenvalue(*sums), 0.0)[np.ix_(at, at)] * share**4
     parts, found = [], []
     edges = np.linspace(0, len(at), PER_SIDE + 1).astype(int)
     for top, bottom in pairwise(edges):
@@ -155,7 +140,7 @@ def _site_points(
     )
 
 
-def _places_of(points: SitePoints, picture: Picture) -> list[tuple[Integers, Floats, Bools]]:
+def _places_of(points: SitePoints, picture: Singles) -> list[tuple[Ints, Floats, Bools]]:
     """The places of a site by each of GUARDS: (col, row) px [n, 2] in its ``picture`` [SITE, SITE],
     planes [n, 3], clear pixels [n, SIDE, SIDE]."""
     at = np.arange(HALF + 1, SITE - HALF - 1, STEP)
@@ -171,25 +156,15 @@ def _places_of(points: SitePoints, picture: Picture) -> list[tuple[Integers, Flo
     found = []
     for clear in points.clear_pixels(centres + MARGIN, planes):
         clear &= np.isfinite(own[0])
-        score = np.where(clear.sum(axis=(1, 2)) >= MIN_CLEAR, _information_of(own, clear), 0.0)
-        best = _best_of_parts(part, score)
+        sums = (np.where(clear, values, 0.0).sum(axis=(1, 2)) for values in own)
+        score = np.where(clear.sum(axis=(1, 2)) >= MIN_CLEAR, _smaller_eigenvalue(*sums), 0.0)
+        best_of: dict[int, int] = {}  # by part
+        for k in np.flatnonzero(score >= MIN_INFORMATION).tolist():
+            if score[k] > score[best_of.setdefault(int(part[k]), k)]:
+                best_of[int(part[k])] = k
+        best = list(best_of.values())
         found.append((centres[best], planes[best, :3], clear[best]))
     return found
-
-
-def _information_of(own: Sequence[Floats], pixels: Bools) -> Floats:
-    """Smaller eigenvalue [k] of the information xx, xy, yy [k, SIDE, SIDE] of some ``pixels`` of
-    windows."""
-    return _smaller_eigenvalue(*(np.where(pixels, values, 0.0).sum(axis=(1, 2)) for values in own))
-
-
-def _best_of_parts(part: Integers, score: Floats) -> list[int]:
-    """The candidate of each ``part`` [k] that has the greatest ``score`` [k], if that is enough."""
-    best: dict[int, int] = {}
-    for k in np.flatnonzero(score >= MIN_INFORMATION).tolist():
-        if score[k] > score[best.setdefault(int(part[k]), k)]:
-            best[int(part[k])] = k
-    return list(best.values())
 
 
 def find_places(
@@ -235,7 +210,7 @@ class TiePoints:
     match's own residuals; ``correlation`` of the windows.
     """
 
-    site: NDArray[np.int64]
+    site: Ints
     height: Floats
     left: Floats
     right: Floats
@@ -261,7 +236,7 @@ def _carry(
     return at[:, 0], carry
 
 
-def _window(source: Source, at: Floats, reach: float) -> tuple[Picture, Floats] | None:
+def _window(source: Source, at: Floats, reach: float) -> tuple[Singles, Floats] | None:
     """The part of an image around positions [n, 2], and the position of its first pixel."""
     low = np.maximum(np.floor(at.min(axis=0) - reach).astype(int), 0)
     high = np.minimum(np.ceil(at.max(axis=0) + reach).astype(int) + 1, source.size)
@@ -270,24 +245,18 @@ def _window(source: Source, at: Floats, reach: float) -> tuple[Picture, Floats] 
     return source.read(*low.tolist(), *(high - low).tolist()), low
 
 
-def _widening(carry: Floats) -> tuple[float, float]:
-    """Widening of the kernel along (col, row) where the right image is the finer one."""
-    spans = np.hypot(carry[:, 0], carry[:, 1])
-    return tuple(float(span) if span > ANTIALIAS else 1.0 for span in spans)
-
-
 @dataclass(frozen=True, eq=False)
 class _Windows:
     """One place, ready for matching: see :func:`_prepared`."""
 
     index: int
-    template: Picture
+    template: Singles
     clear: Floats
-    pixels: Picture
+    pixels: Singles
     at: Floats
     carry: Floats
     scale: tuple[float, float]
-    scores: Picture
+    scores: Singles
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,7 +291,7 @@ class Geometry:
         return cls(where, height, at, carry, along)
 
 
-def _even(picture: Picture) -> Picture:
+def _even(picture: Singles) -> Singles:
     """A picture without the brightness of its surroundings, and no pixel above the usual contrast.
 
     So that an edge that stands out has no more say than the texture around it; 0 where the picture
@@ -368,8 +337,10 @@ def _prepared(
             clear = (places.clear[k] & (holes[1:-1, 1:-1] == 0)).astype(np.float32)
             if clear.sum() < MIN_CLEAR:
                 continue
-            carry, scale = geometry.carry[k], _widening(geometry.carry[k])
-            at = geometry.right[k] - origin
+            carry, at = geometry.carry[k], geometry.right[k] - origin
+            # of the kernel along (col, row), where the right image is the finer one
+            spans = np.hypot(carry[:, 0], carry[:, 1]).tolist()
+            scale = tuple(span if span > ANTIALIAS else 1.0 for span in spans)
             warp_patch(pixels, *at, carry, scale, big)
             if np.isfinite(big).mean() < 0.5:
                 continue

@@ -354,10 +354,9 @@ def fit_epipolar(
         if rms > ACCEPTED_RMS:
             defect = f"y-parallax of {rms:.3f} px rms where the RPCs are valid"
     if defect:
-        log.warning("epipolar model: %s; fitted to the image footprints only", defect)
         images, rms = grow(in_frames, [check_frames], surface, rotation)
-        if rms > ACCEPTED_RMS:
-            log.warning("epipolar model: %.3f px rms remain even so", rms)
+        left_over = f", where {rms:.3f} px rms of y-parallax remain" if rms > ACCEPTED_RMS else ""
+        log.warning("epipolar model: %s; fitted to the images' footprints%s", defect, left_over)
 
     x0, y0, shape, disparities = _grid(*images, sizes, in_frames, names)
     images = images[0].shifted(x0, y0), images[1].shifted(x0, y0)

@@ -1,10 +1,9 @@
 """Lists of tiles: which files a catalogue has for a site, as a sheet that one can read.
 
-A list is written once, by the command that looks into the catalogue and asks the servers. A plan
-reads the list alone and asks nobody. Each tile has the size and the content (ETag) that its server
-has told: a tile that is another one by then ends the job that reads it. The lines before the
-columns (``# key: value``) hold where the tiles come from and how much of the footprint no tile
-covers.
+A list is written once, by the command that looks into the catalogue and asks the servers; plans and
+jobs read the list alone. A tile that is another one by then (size, ETag) ends the job that reads
+it. The lines before the columns (``# key: value``) hold where the tiles come from and how much of
+the footprint no tile covers.
 """
 
 from __future__ import annotations

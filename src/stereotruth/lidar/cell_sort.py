@@ -13,19 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Ints, Words
 from ..core.products.files import sealed
 from .lattice import CELL_BITS, PER_DEG, PER_M, cell_key
 from .point_store import ATTRIBUTES, CELL, CELLS, POINTS, SQUARES, STRIPS, WORDS
-
-Integers = NDArray[np.int64]
-Words = NDArray[np.uint32]
 
 RUN_WORDS = WORDS + 1  # of 32 bits, of a point in the scratch: with the codes of its strip
 RUN_BYTES = 4 * RUN_WORDS
 SCRATCH_POINTS = (1 << 28) // RUN_BYTES  # kept in memory, 256 MiB
 
 
-def bounds_of(limits: Integers) -> list[float]:
+def bounds_of(limits: Ints) -> list[float]:
     """lon_min, lat_min, lon_max, lat_max (degrees), h_min, h_max (m) of lattice limits [2, 3]."""
     low, high = limits
     degrees = (float(value) / PER_DEG for value in (low[0], low[1], high[0], high[1]))
@@ -33,7 +31,7 @@ def bounds_of(limits: Integers) -> list[float]:
 
 
 @kernel
-def _number_cells(lattice: Integers, row: int, col: int, width: int, out: Integers) -> None:
+def _number_cells(lattice: Ints, row: int, col: int, width: int, out: Ints) -> None:
     """Number of the cell of each point in a raster of cells, its first cell at row, col."""
     for i in range(out.size):
         out[i] = ((lattice[1, i] >> CELL_BITS) - row) * width + (lattice[0, i] >> CELL_BITS) - col
@@ -41,11 +39,11 @@ def _number_cells(lattice: Integers, row: int, col: int, width: int, out: Intege
 
 @kernel
 def _sort(
-    lattice: Integers,
+    lattice: Ints,
     attributes: Words,
     strips: Words,
-    cell: Integers,
-    end: Integers,
+    cell: Ints,
+    end: Ints,
     limits: NDArray[np.int32],
     run: Words,
 ) -> None:
@@ -87,14 +85,14 @@ def _sort(
 
 
 @kernel
-def _count_squares(points: Words, counts: Integers) -> None:
+def _count_squares(points: Words, counts: Ints) -> None:
     """Add stored points [n, 3] of a cell to the counts [SQUARES, SQUARES] of its squares."""
     inside, size = (1 << CELL_BITS) - 1, (1 << CELL_BITS) // SQUARES
     for i in range(len(points)):
         counts[(points[i, 1] & inside) // size, (points[i, 0] & inside) // size] += 1
 
 
-def _cells(lattice: Integers) -> tuple[Integers, Integers]:
+def _cells(lattice: Ints) -> tuple[Ints, Ints]:
     """Keys of cells [m], sorted, and the number among these of each point's cell [n]."""
     low_col, low_row = lattice[:2].min(axis=1) >> CELL_BITS
     high_col, high_row = lattice[:2].max(axis=1) >> CELL_BITS
@@ -131,7 +129,7 @@ class SortedRuns:
         disk.truncate()
         return cls(np.empty((room, RUN_WORDS), "<u4"), disk)
 
-    def add(self, lattice: Integers, attributes: Words, strips: Words) -> None:
+    def add(self, lattice: Ints, attributes: Words, strips: Words) -> None:
         """Take in a chunk's points: lattice coordinates [3, n], attributes and codes of strips [n]
         as of :meth:`.point_fields.PointTally.take`."""
         size = attributes.size
@@ -157,7 +155,7 @@ class SortedRuns:
         self._limits.append(limits[here])
         self.written += size
 
-    def _take(self, segments: Integers) -> Iterator[Words]:
+    def _take(self, segments: Ints) -> Iterator[Words]:
         """The points of segments, each at once."""
         for _, start, count in segments.tolist():
             if start < self._held:

@@ -11,7 +11,6 @@ import struct
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -330,11 +329,10 @@ def header_crs(header: laspy.LasHeader) -> tuple[LidarCRS | None, list[str]]:
             records.setdefault(record.record_id, record.record_data_bytes())
     x, y = float(header.mins[0]), float(header.mins[1])
     wkt = records.get(2112, b"").split(b"\0")[0].decode("utf-8", errors="replace").strip()
+    keys = [records.get(number, b"") for number in (34735, 34736, 34737)]
     readers: dict[str, Callable[[], LidarCRS | None]] = {
         "WKT": lambda: _held_against_code(interpret_wkt(wkt), x, y) if wkt else None,
-        "GeoTIFF keys": partial(
-            _from_geokeys, *(records.get(number, b"") for number in (34735, 34736, 34737))
-        ),
+        "GeoTIFF keys": lambda: _from_geokeys(*keys),
     }
     meanings: list[LidarCRS] = []
     problems: list[str] = []

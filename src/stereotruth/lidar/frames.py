@@ -1,15 +1,13 @@
 """From the terrestrial frame of coordinates to ITRF2020 at the date of the images.
 
-Two legs, both explicit, since PROJ does nothing when the epoch alone changes: the frame to ITRF2020
-at the epoch of the coordinates, by PROJ's time-dependent transformation or that of the ITRF that
+Two legs: the frame to ITRF2020 at the epoch of the coordinates, by PROJ or that of the ITRF that
 the frame is a realisation of (:data:`REALISATIONS`); and from that epoch to that of the target by
-the motion of the plate. Which epoch the coordinates of a frame have: docs/explanation/frames.md.
+the motion of the plate. Why, and which epoch coordinates have: docs/explanation/frames.md.
 
 Plates: ITRF2020 Plate Motion Model, Altamimi et al. (2023), doi 10.1029/2023GL106373, tables 1 and
-2. As the paper advises, the bias of the origin's rate is added to the horizontal velocities, and
-what it makes of vertical ones is left out. The plates' outlines are coarse: straight lines between
-places that lie some tens of km beside the boundaries of Bird (2003, doi 10.1029/2001GC000252).
-Zones that belong to no rigid plate of the model (Japan, Anatolia, Iceland …) lie in none of them.
+2, with the bias of the origin's rate in the horizontal. Outlines are coarse: straight lines some
+tens of km beside the boundaries of Bird (2003, doi 10.1029/2001GC000252). Zones of no rigid plate
+(Japan, Anatolia, Iceland …) lie in none of them.
 """
 
 from __future__ import annotations
@@ -22,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.aoi import AreaOfInterest
 from pyproj.crs import Datum, GeographicCRS
@@ -30,9 +27,9 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import turn
 
-Floats = NDArray[np.float64]
 Place = tuple[Floats, Floats, Floats]
 
 NAME = "ITRF2020"

@@ -1,8 +1,7 @@
 """Geoids: grids of their heights from GTX or GeoTIFF files, and those that PROJ knows of a place.
 
-Heights without a declared surface may count from any of the geoids of a place. Nothing is chosen
-here: names of grids are those of PROJ's register, which has for each the ground that it is made
-for; a grid is looked at if it is on this machine, and is never fetched.
+Nothing is chosen here: names of grids are those of PROJ's register, which has for each the ground
+that it is made for; a grid is looked at if it is on this machine, and is never fetched.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import re
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +55,6 @@ GROUP BY v.name, a.proj_grid_name ORDER BY 3, 4, v.name, a.proj_grid_name DESC
 """
 
 
-@dataclass
 class GeoidGrid:
     """Undulations N (m above the GRS 80 or WGS 84 ellipsoid) of a GTX or GeoTIFF grid.
 
@@ -66,12 +64,9 @@ class GeoidGrid:
     national datum on the same ellipsoid. Raises InputError if the file is no usable grid.
     """
 
-    path: Path
-    _first_row: int = field(default=0, init=False, repr=False)
-    _rows: np.ndarray | None = field(default=None, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self.path = Path(self.path)
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._first_row, self._rows = 0, None
         if not self.path.is_file():
             raise InputError(
                 "no such geoid grid", file=self.path, remedy="give the path of a GTX or GeoTIFF"

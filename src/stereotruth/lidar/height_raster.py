@@ -1,15 +1,10 @@
 """Rasters of heights on the ground: where their cells lie, and what their heights count from.
 
-The one reader of surface models and elevation models, for LiDAR, scores and control points: values
-by :mod:`..core.products.rasters`, systems by :mod:`.declared_crs`, datums by
-:mod:`.to_wgs84`. Pixels that are points (AREA_OR_POINT) are the middles of their cells.
-
-Places are metres on the ground along the raster's columns and against its rows, from the centre of
-the upper-left cell: (x, y) = (column · dx, −row · dy), dx and dy being what a cell measures on the
-ellipsoid in the raster's middle. So any north-up grid serves, in degrees, feet or a projection
-whose metres are none on the ground; :meth:`HeightRaster.to_enu` turns shifts to east and north.
-
-As LiDAR, each cell that has a height becomes a point in its middle, a record of LAS format 6 of
+The one reader of surface and elevation models, for LiDAR, scores and control points. Pixels that
+are points (AREA_OR_POINT) are the middles of their cells. Places are metres on the ground from the
+centre of the upper-left cell, (x, y) = (column · dx, −row · dy), by what a cell measures on the
+ellipsoid in the raster's middle: so any north-up grid serves, in degrees, feet or a
+projection. As LiDAR, each cell that has a height becomes a point in its middle, of LAS format 6 and
 class 1 (unclassified), the only return of its pulse.
 """
 
@@ -27,11 +22,11 @@ from typing import Any
 import laspy
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats, Singles
 from ..core.numerics.geometry import exact_metres_per_degree, turn
 from ..core.numerics.interpolation import bilinear
 from ..core.products.file_parts import open_stream
@@ -50,8 +45,6 @@ from .frames import Epochs
 from .to_wgs84 import ToWGS84, transformation
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
-Heights = NDArray[np.float32]
 WIDEST_M = 1e5  # metres along the cells are those of the raster's middle
 BASE = 16.0  # cells over which a cell is measured
 CLASSES = Quantity(
@@ -202,8 +195,8 @@ class HeightRaster:
         box = self.to_wgs84.ground_boxes(np.array([[west, south]]), np.array([[east, north]]))
         return tuple(map(float, box[0]))
 
-    def window(self, rows: slice, cols: slice) -> Heights:
-        """Heights in m of a window that may reach over the edges; NaN where there are none."""
+    def window(self, rows: slice, cols: slice) -> Singles:
+        """Singles in m of a window that may reach over the edges; NaN where there are none."""
         out = np.full((rows.stop - rows.start, cols.stop - cols.start), np.nan, np.float32)
         top, left = max(rows.start, 0), max(cols.start, 0)
         bottom, right = min(rows.stop, self.shape[0]), min(cols.stop, self.shape[1])
@@ -215,19 +208,19 @@ class HeightRaster:
         return out
 
     def _read(self, **how: Any) -> Floats:
-        """Heights in m by rasterio's ``window`` or ``out_shape``; NaN where there are none."""
+        """Singles in m by rasterio's ``window`` or ``out_shape``; NaN where there are none."""
         unit = self.to_wgs84.system.height_unit_m
         with open_raster(self.path) as source:
             return unit * Values(source, self.path, self.quantity, unit).read(**how)
 
     def decimated(self, most: int) -> tuple[Floats, float]:
-        """Heights in m at ``most`` cells along the longer side, and how many cells are one."""
+        """Singles in m at ``most`` cells along the longer side, and how many cells are one."""
         times = max(max(self.shape) / most, 1.0)
         shape = tuple(max(2, round(side / times)) for side in self.shape)
         return self._read(out_shape=shape), times
 
     def heights_at(self, lon: Floats, lat: Floats) -> Floats:
-        """Heights over the WGS 84 ellipsoid, m [n], bilinear; NaN where there is none.
+        """Singles over the WGS 84 ellipsoid, m [n], bilinear; NaN where there is none.
 
         Raises InputError for fill values around the places.
         """
@@ -256,12 +249,12 @@ class HeightRaster:
 
 @dataclass(frozen=True)
 class Window:
-    """Heights of a part of a raster, and how they are taken at any place.
+    """Singles of a part of a raster, and how they are taken at any place.
 
     ``heights`` [h, w] begin with the cell ``first`` (row, column).
     """
 
-    heights: Heights
+    heights: Singles
     first: tuple[int, int]
     cell_m: tuple[float, float]
 
@@ -271,7 +264,7 @@ class Window:
         return col, -np.asarray(y) / self.cell_m[1] - self.first[0]
 
     def at(self, x: Floats, y: Floats) -> Floats:
-        """Heights at places, of any shape, bilinear; NaN where one of the four cells lacks."""
+        """Singles at places, of any shape, bilinear; NaN where one of the four cells lacks."""
         return bilinear(self.heights, *self.cells(x, y))
 
 
@@ -290,14 +283,6 @@ class _Parts(io.RawIOBase):
         if path != self._name or mode != "rb":
             raise FileNotFoundError(path)
         return self
-
-    def readable(self) -> bool:
-        """It is."""
-        return True
-
-    def seekable(self) -> bool:
-        """It is."""
-        return True
 
     def tell(self) -> int:
         """The place of the next byte."""

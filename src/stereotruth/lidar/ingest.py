@@ -1,10 +1,9 @@
 """LiDAR files to spatially ordered point stores, and what their headers say without their points.
 
-Every point lies on one global lattice (:mod:`.lattice`). Sums over lattice integers are exact, so
-that nothing later depends on the order of files or points. Points are stored by square cells,
-cells in row-major order (south to north, west to east), inside a cell in the order of the file. The
-store of a file is the same to the byte whatever the size of the reading chunks; of a footprint, it
-is the file's own store without the other cells. Its files: see :mod:`.point_store`.
+Every point lies on one global lattice (:mod:`.lattice`), so that nothing later depends on the order
+of files or points. The store of a file is the same to the byte whatever the size of the reading
+chunks; of a footprint, it is the file's own store without the other cells. Its files: see
+:mod:`.point_store`.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ from typing import Any, BinaryIO
 
 import laspy
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.geometry import DEGREE_M
 from ..core.products.files import atomic_folder
 from ..core.products.remote_files import url_of
@@ -36,8 +35,6 @@ from .to_wgs84 import ToWGS84, area_of, check_area, to_wgs84
 
 log = logging.getLogger("stereotruth")
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # its remarks name no file
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 NOISE_CLASSES = (7, 18)  # low, high
 COARSEST_STEP_M = 0.5  # coordinates stored in coarser steps are refused: a pixel is 0.3-1 m
@@ -248,7 +245,7 @@ def _touching(transform: ToWGS84, footprint: Footprint | None) -> Touches | None
     if footprint is None:
         return None
 
-    def touch(low: Floats, high: Floats) -> NDArray[np.bool_]:
+    def touch(low: Floats, high: Floats) -> Bools:
         boxes = transform.ground_boxes(low, high)
         unknown = ~np.isfinite(boxes).all(axis=1)
         return footprint.touches(np.where(unknown[:, None], 0.0, boxes)) | unknown
@@ -257,7 +254,7 @@ def _touching(transform: ToWGS84, footprint: Footprint | None) -> Touches | None
 
 
 @kernel
-def _round(lon: Floats, lat: Floats, height: Floats, out: Integers, limits: Integers) -> bool:
+def _round(lon: Floats, lat: Floats, height: Floats, out: Ints, limits: Ints) -> bool:
     """Fill ``out`` [3, n] with lattice coordinates and widen ``limits`` [2, 3] by them.
 
     False if there is a point that has no place on Earth; then ``out`` is not whole.
@@ -278,7 +275,7 @@ def _round(lon: Floats, lat: Floats, height: Floats, out: Integers, limits: Inte
     return True
 
 
-def _to_lattice(transform: ToWGS84, xyz: Floats, limits: Integers, file: Path) -> Integers:
+def _to_lattice(transform: ToWGS84, xyz: Floats, limits: Ints, file: Path) -> Ints:
     """Lattice longitude, latitude, height (int64[3, n]) of file coordinates; widens ``limits``."""
     try:
         lon, lat, height = transform(*xyz)

@@ -19,9 +19,9 @@ import laspy
 import lazrs
 import numpy as np
 from laspy.compression import DecompressionSelection
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Ints
 from ..core.products.file_parts import GLANCE_BYTES, STREAM_BYTES, open_stream
 from ..core.products.remote_files import size_of
 
@@ -125,7 +125,7 @@ class Layout:
     first_evlr: int = 0
     evlrs: int = 0
     packing: Packing | None = None
-    chunks: NDArray[np.int64] | None = None
+    chunks: Ints | None = None
 
     @classmethod
     def of(cls, stream: BinaryIO, size: int) -> Layout:

@@ -14,15 +14,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.geometry import DEGREE_M, metres_per_degree
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Box = tuple[float, float, float, float]
 
 LATTICE_DEG = 1e-9
@@ -37,11 +34,6 @@ FAR = 0.5  # degrees; no survey lies that far from the images that it was ordere
 def cell_key(row: np.ndarray, col: np.ndarray) -> np.ndarray:
     """One int64 that sorts cells by row, then column."""
     return (np.asarray(row, np.int64) << 32) + (np.asarray(col, np.int64) + (1 << 30))
-
-
-def cell_m2(row: np.ndarray) -> Floats:
-    """Ground of a cell of each of the rows, m²."""
-    return (CELL_DEG * DEGREE_M) ** 2 * np.cos(np.radians((row + 0.5) * CELL_DEG))
 
 
 def lattice_box(
@@ -114,15 +106,16 @@ class Footprint:
 
     @property
     def cell_m2(self) -> Floats:
-        """Ground of a cell of each row."""
-        return cell_m2(self.row + np.arange(self.held.shape[0]))
+        """Ground of a cell of each row, m²."""
+        row = self.row + np.arange(self.held.shape[0])
+        return (CELL_DEG * DEGREE_M) ** 2 * np.cos(np.radians((row + 0.5) * CELL_DEG))
 
     @cached_property
-    def _sums(self) -> Integers:
+    def _sums(self) -> Ints:
         """Summed-area table of the cells."""
         return np.pad(self.held, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
 
-    def contains(self, lattice: Integers) -> Bools:
+    def contains(self, lattice: Ints) -> Bools:
         """Which points lie in it: lattice longitude and latitude [2 or more, n]."""
         inside = np.empty(lattice.shape[1], np.bool_)
         _mark(lattice, self.held, self.row, self.col, inside)
@@ -142,7 +135,7 @@ class Footprint:
         each = (CELL_DEG * DEGREE_M) ** 2 * np.cos(np.radians(lat))
         return float((cells - count) @ each)
 
-    def _count(self, boxes: Floats) -> tuple[Integers, Integers]:
+    def _count(self, boxes: Floats) -> tuple[Ints, Ints]:
         """How many cells of boxes are its own, and how many there are."""
         at = np.floor(np.asarray(boxes, np.float64).reshape(-1, 4) / CELL_DEG)
         at = np.clip(at, -(2**31), 2**31).astype(np.int64)
@@ -176,7 +169,7 @@ def _runs(outline: Floats, east: float, north: float) -> list[list[int]]:
 
 
 @kernel
-def _mark(lattice: Integers, held: Bools, row: int, col: int, inside: Bools) -> None:
+def _mark(lattice: Ints, held: Bools, row: int, col: int, inside: Bools) -> None:
     """Set ``inside`` to whether the cell of each point is held."""
     for i in range(inside.size):
         y, x = (lattice[1, i] >> CELL_BITS) - row, (lattice[0, i] >> CELL_BITS) - col

@@ -1,15 +1,11 @@
 """Octrees of points (COPC, EPT) of which a footprint is read, with checks that none is missing.
 
-An octree keeps its points in nodes: cubes of half the side of their parent's. Which nodes may hold
-points of a footprint follows from the octree's own cube, never from the header's bounds, which
-writers get wrong. Before any point is read, the counts of all nodes of the hierarchy must add up to
-the header's count. While points are read, each node must hold as many as the hierarchy says, all of
-them within the node's cube: else other nodes may hold points of the footprint too.
-
-COPC is a LAZ file whose chunks are the nodes: its chunk table and its hierarchy tell the same by
-different ways. laspy's own reader is not asked, as its answer is cut by a box, and cannot tell
-whether a node keeps to its cube. Of Entwine Point Tiles, each node is a LAZ file of its own.
-Sources: COPC 1.0 (Hobu); Entwine Point Tile 1.0 (entwine.io).
+Which nodes (cubes of half the side of their parent's) may hold points of a footprint follows from
+the octree's own cube, never from the header's bounds. The counts of all nodes must add up to the
+header's, and each node that is read must hold as many points, all within its cube. laspy's reader
+of COPC is not asked, as its answer is cut by a box, and cannot tell whether a node keeps to its
+cube. See docs/how-to/national_lidar.md. Sources: COPC 1.0 (Hobu), a LAZ file whose chunks are the
+nodes; Entwine Point Tile 1.0 (entwine.io), where each node is a LAZ file.
 """
 
 from __future__ import annotations
@@ -34,6 +30,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from ..core.errors import InputError, in_number
+from ..core.numerics.arrays import Bools, Floats
 from ..core.products.file_parts import (
     GLANCE_BYTES,
     LocalParts,
@@ -46,9 +43,8 @@ from ..core.products.remote_files import AT_ONCE, hosts_of, read_bytes, url_of
 from .catalogue_list import EPT
 from .las_files import FIELDS, LAYERED, Layout, check_layout, decoding, records, require
 
-Floats = NDArray[np.float64]
 Numbers = NDArray[np.intp]
-Touches = Callable[[Floats, Floats], NDArray[np.bool_]]
+Touches = Callable[[Floats, Floats], Bools]
 """Which boxes, by lowest and highest corners [n, 3], may hold points that are wanted."""
 
 NODE = np.dtype([("key", "<i4", 4), ("start", "<i8"), ("bytes", "<i8"), ("points", "<i8")])
@@ -93,8 +89,12 @@ class Octree(ABC):
     side: float
 
     @abstractmethod
-    def _decoded(self, numbers: Numbers) -> Iterator[ScaleAwarePointRecord]:
-        """All points of each of the nodes."""
+    def _contents(self, numbers: Numbers) -> Iterator[bytes]:
+        """The compressed points of each of the nodes."""
+
+    @abstractmethod
+    def _points(self, count: int, content: bytes) -> ScaleAwarePointRecord:
+        """The points of a node that holds so many. Raises whatever libraries raise."""
 
     def boxes(self, nodes: np.ndarray) -> tuple[Floats, Floats]:
         """Lowest and highest corners [n, 3] of nodes' cubes, with what rounding may add to them."""
@@ -138,7 +138,9 @@ class Octree(ABC):
         Raises InputError: a node of other points than the hierarchy says, or points out of its
         cube; what a server or a damaged file fails with.
         """
-        for node, points in zip(self.nodes[numbers], self._decoded(numbers), strict=True):
+        for node, content in zip(self.nodes[numbers], self._contents(numbers), strict=True):
+            with decoding(lambda error, n=node: self._refusal(f"node {shown(n)}: {error}")):
+                points = self._points(int(node["points"]), content)
             if len(points) != node["points"]:
                 raise self._refusal(
                     f"node {shown(node)} holds {len(points)} points, the hierarchy says "
@@ -280,19 +282,15 @@ class Copc(Octree):
         nodes = every[every["points"] > 0].astype(NODE)
         return nodes[np.argsort(nodes["start"], kind="stable")]
 
-    def _decoded(self, numbers: Numbers) -> Iterator[ScaleAwarePointRecord]:
+    def _contents(self, numbers: Numbers) -> Iterator[bytes]:
         ends = np.cumsum(self.nodes["bytes"][numbers])
         for batch in np.split(numbers, np.flatnonzero(np.diff(ends // BATCH_BYTES)) + 1):
-            nodes = self.nodes[batch]
-            ranges = list(zip(nodes["start"].tolist(), (nodes["start"] + nodes["bytes"]).tolist()))
-            for node, content in zip(nodes, self._parts.get(ranges)):
-                with decoding(lambda error, n=node: self._refusal(f"node {shown(n)}: {error}")):
-                    points = self._points(int(node["points"]), content)
-                yield points
+            start = self.nodes["start"][batch]
+            end = start + self.nodes["bytes"][batch]
+            yield from self._parts.get(list(zip(start.tolist(), end.tolist())))
 
     def _points(self, count: int, content: bytes) -> ScaleAwarePointRecord:
-        """The points of a chunk, whose layers are held against its bytes first."""
-        form = self.header.point_format
+        form = self.header.point_format  # layers are held against the bytes first
         layers = np.frombuffer(content, "<u4", 1 + self._packing.layers, form.size).astype(np.int64)
         head = form.size + 4 * layers.size
         require(head + int(layers[1:].sum()) == len(content), "its layers do not fill it")
@@ -391,16 +389,12 @@ class Ept(Octree):
     def _node_file(self, node: np.void) -> bytes:
         return self._read(f"ept-data/{shown(node)}.laz", MOST_NODE_BYTES)
 
-    def _decoded(self, numbers: Numbers) -> Iterator[ScaleAwarePointRecord]:
+    def _contents(self, numbers: Numbers) -> Iterator[bytes]:
         with ThreadPoolExecutor(AT_ONCE) as pool:
             for batch in np.split(numbers, range(AT_ONCE, len(numbers), AT_ONCE)):
-                contents = pool.map(self._node_file, self.nodes[batch])
-                for node, content in zip(self.nodes[batch], contents):
-                    with decoding(lambda e, n=node: self._refusal(f"node {shown(n)}: {e}")):
-                        points = self._points(content)
-                    yield points
+                yield from pool.map(self._node_file, self.nodes[batch])
 
-    def _points(self, content: bytes) -> ScaleAwarePointRecord:
+    def _points(self, count: int, content: bytes) -> ScaleAwarePointRecord:
         stream, backend = io.BytesIO(content), laspy.LazBackend.Lazrs
         with laspy.open(stream, laz_backend=backend, decompression_selection=FIELDS) as reader:
             one, whole = reader.header, self.header

@@ -1,16 +1,14 @@
 """What the records of points tell beside their places, counted and coded as they are read.
 
-Days. LAS files have either seconds of a GPS week, which tell no day, or adjusted standard GPS time:
-seconds since 1980-01-06 less 10⁹ (LAS 1.4 R16, "Global Encoding", bit 0), or less another offset
-that the header of LAS 1.5 names (bit 6). Days are counted from 1970-01-01; 0 stands for none. A
-point store has a code of 8 bits for the day of each point, 1 + day modulo :data:`DAY_CODES`.
+Days. GPS times are seconds of a week, which tell no day, or seconds since 1980-01-06 less 10⁹ (LAS
+1.4 R16, "Global Encoding", bit 0), or less another offset of the header of LAS 1.5 (bit 6). Days
+count from 1970-01-01; 0 stands for none. A store has a code of 8 bits for the day of each point, 1
++ day modulo :data:`DAY_CODES`.
 
-Strips of a flight are told by ``point_source_id``, else by GPS times, where no point was measured
-for a while, else by flags of the edge of a flight line: two edges that follow each other are a line
-of pulses apart within a strip, and far apart between strips. Codes follow from a point alone, so
-that a point has the same in any part of a file that is read: the ``point_source_id`` itself, or the
-time in steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`). Only the
-strips of edge flags are numbered within their file. See docs/explanation/real_sensors.md.
+Strips of a flight (docs/explanation/real_sensors.md). Codes follow from a point alone, so that a
+point has the same in any part of a file that is read: the ``point_source_id`` itself, or the time
+in steps of :data:`BIN_S`, whose runs without a gap are strips (:func:`runs_of`). Only the strips of
+edge flags, two of which follow each other far apart between strips, are numbered in their file.
 """
 
 from __future__ import annotations
@@ -27,14 +25,11 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import inner, kernel
+from ..core.numerics.arrays import Bools, Bytes, Floats, Ints, Words
 
 if TYPE_CHECKING:
     import laspy
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
-Words = NDArray[np.uint32]
 Days = NDArray[np.uint16]
 
 ADJUSTED_S = 1e9
@@ -90,7 +85,7 @@ def days_by_code(days: Sequence[str], acquired: Mapping[str, Any] | None) -> Day
     return out
 
 
-def runs_of(steps: Sequence[int] | Integers) -> Integers:
+def runs_of(steps: Sequence[int] | Ints) -> Ints:
     """First step of the run that each of some steps of time [n], ascending, belongs to.
 
     Between two runs lies a step in which no point was measured.
@@ -109,14 +104,14 @@ class PointTally:
     points that nobody measured.
     """
 
-    counts: Integers = field(default_factory=lambda: np.zeros((2, 257), np.int64))
-    by_return: Integers = field(default_factory=lambda: np.zeros(16, np.int64))
-    file_limits: Integers = field(default_factory=NO_LIMITS.copy)
-    lattice_limits: Integers = field(default_factory=NO_LIMITS.copy)
+    counts: Ints = field(default_factory=lambda: np.zeros((2, 257), np.int64))
+    by_return: Ints = field(default_factory=lambda: np.zeros(16, np.int64))
+    file_limits: Ints = field(default_factory=NO_LIMITS.copy)
+    lattice_limits: Ints = field(default_factory=NO_LIMITS.copy)
     synthetic: int = 0
-    _days: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(1 << 16, np.bool_))
-    _sources: Integers = field(default_factory=lambda: np.zeros(STRIP_CODES, np.int64))
-    _others: Integers = field(default_factory=lambda: np.zeros(STRIP_CODES, np.int64))
+    _days: Bools = field(default_factory=lambda: np.zeros(1 << 16, np.bool_))
+    _sources: Ints = field(default_factory=lambda: np.zeros(STRIP_CODES, np.int64))
+    _others: Ints = field(default_factory=lambda: np.zeros(STRIP_CODES, np.int64))
     _edges: Floats = field(default_factory=lambda: np.zeros(7))
     _has_times: bool | None = None  # by the first point
     _sample: list[np.ndarray] = field(default_factory=list)
@@ -202,7 +197,7 @@ class PointTally:
         """Points read that were not dropped."""
         return int(self.counts[0].sum())
 
-    def widen(self, lattice: Integers) -> None:
+    def widen(self, lattice: Ints) -> None:
         """Widen ``lattice_limits`` by points [3, n]."""
         if lattice.size:
             low, high = self.lattice_limits
@@ -260,7 +255,7 @@ class PointTally:
             return text
         raise InputError(f"truncated or damaged: {text}", file=file, remedy=_ANEW)
 
-    def sample(self, lattice: Integers) -> None:
+    def sample(self, lattice: Ints) -> None:
         """Keep the first points [3, n] for :meth:`refuse_quantised`."""
         missing = SAMPLE_POINTS - sum(map(len, self._sample))
         if missing > 0:
@@ -293,7 +288,7 @@ def _times_of(fields: np.ndarray, header: laspy.LasHeader) -> Floats | None:
 
 # Kernels free the GIL; nothing in them depends on how the points are cut into chunks.
 @kernel
-def _encode_days(times: Floats, seen: NDArray[np.bool_], code: Words) -> None:
+def _encode_days(times: Floats, seen: Bools, code: Words) -> None:
     """Fill ``code`` [n] from times (s, adjusted), and mark their days in ``seen``.
 
     0 and what is no time since 1980 were never filled in.
@@ -341,13 +336,13 @@ def _integer(raw: Bytes, i: int, at: int) -> int:
 def _unpack(
     raw: Bytes,
     extended: bool,
-    unwanted: NDArray[np.bool_],
+    unwanted: Bools,
     scale_offset: Floats,
     xyz: Floats,
     attributes: Words,
-    counts: Integers,
-    by_return: Integers,
-    limits: Integers,
+    counts: Ints,
+    by_return: Ints,
+    limits: Ints,
 ) -> int:
     """Fill ``xyz`` [3, n] and ``attributes`` [2, n] with the points to keep; returns their number.
 

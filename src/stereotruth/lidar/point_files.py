@@ -1,12 +1,9 @@
 """A file of points, whatever its format: LAS, LAZ, COPC, EPT, or a surface model as a raster.
 
 A format is a class here, with the header that a LAS file of its points would have and with its
-points as records of LAS; :func:`open_points` tells which one a file has.
-
-Of a file, that part is read which may hold points of a footprint. Of an octree, these are nodes. Of
-other files it is all or nothing: nothing where the header's bounds miss the footprint. LAS headers
-are written by software that errs, so that they are held against some points all over the file: if
-one of these lies outside, the header counts for nothing, and the file is read.
+points as records of LAS. Of an octree, the nodes that may hold points of a footprint are read; of
+other files all or nothing: nothing where the header's bounds miss the footprint, and some points
+all over the file do not contradict these.
 """
 
 from __future__ import annotations

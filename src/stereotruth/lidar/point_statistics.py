@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.geometry import DEGREE_M, metres_per_degree
 from .lattice import CELL_DEG, LATTICE_M
 from .point_store import SQUARES, Points, PointStore, query_points
 
-Floats = NDArray[np.float64]
-Shows = Callable[[Floats, Floats, Floats], NDArray[np.bool_]]
+Shows = Callable[[Floats, Floats, Floats], Bools]
 
 ENOUGH = 8.0  # points in a square that holds any, on the average
 SQUARE_M = 2.0  # of the roughness: so wide that 1 point/m² leaves few squares without a point
@@ -64,7 +63,7 @@ def points_per_m2(stores: Sequence[PointStore], shows: Shows | None = None) -> f
     return float(counts[covered].sum() / (covered.sum(axis=(1, 2)) @ square_m2))
 
 
-def _shown(cells: NDArray[np.int64], height: Floats, shows: Shows) -> NDArray[np.bool_]:
+def _shown(cells: Ints, height: Floats, shows: Shows) -> Bools:
     """Whether the middle of each square [cells, SQUARES, SQUARES] is shown, at a cell's
     ``height``."""
     middle = (np.arange(SQUARES) + 0.5) / SQUARES

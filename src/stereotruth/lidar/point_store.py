@@ -40,14 +40,10 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bytes, Ints, Words
 from ..core.products.files import damaged_store, read_record
 from .lattice import CELL_BITS, PER_DEG, PER_M, Footprint, apart, cell_key, lattice_box
 from .point_fields import Days, days_by_code
-
-Bytes = NDArray[np.uint8]
-Integers = NDArray[np.int64]
-Words = NDArray[np.uint32]
-
 
 FORMAT = 5  # of the files
 ASSUMED = "ellipsoidal (assumed)"  # of heights that nothing declares
@@ -132,13 +128,13 @@ class Points:
 @kernel
 def _select(
     stored: Words,
-    start: Integers,
-    corner: Integers,
-    box: Integers,
+    start: Ints,
+    corner: Ints,
+    box: Ints,
     days: Days,
-    lon: Integers,
-    lat: Integers,
-    height: Integers,
+    lon: Ints,
+    lat: Ints,
+    height: Ints,
     out: Bytes,
     day: Days,
 ) -> int:
@@ -238,7 +234,7 @@ class PointStore:
         return str(self.attrs["crs"]["heights"]).startswith(ASSUMED)
 
     @property
-    def cell_counts(self) -> Integers:
+    def cell_counts(self) -> Ints:
         """Points in each cell."""
         return np.diff(self._start)
 
@@ -331,7 +327,7 @@ class PointStore:
     def _strips_offset(self) -> int:
         return self._first_byte(STRIPS, (self.count,), "<u2")
 
-    def _stored(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[Words, Integers, slice]]:
+    def _stored(self, ranges: Iterable[tuple[int, int]]) -> Iterator[tuple[Words, Ints, slice]]:
         """Points of ranges of cells as they are stored, [n, 3], a piece at a time.
 
         With the cells that a piece is of, and where the points of each begin in it.
@@ -397,15 +393,10 @@ def _datum_name(wkt: str) -> str:
 
 
 def query_points(
-    stores: Sequence[PointStore | str | Path],
-    lon_min: float,
-    lat_min: float,
-    lon_max: float,
-    lat_max: float,
+    stores: Sequence[PointStore], lon_min: float, lat_min: float, lon_max: float, lat_max: float
 ) -> Points:
     """Points of a box (degrees, inclusive) in all stores, store after store."""
-    opened = [s if isinstance(s, PointStore) else PointStore(s) for s in stores]
     box = (lon_min, lat_min, lon_max, lat_max)
     return Points.concatenate(
-        [store.query(*box) for store in opened if not apart(store.bounds[:4], box)]
+        [store.query(*box) for store in stores if not apart(store.bounds[:4], box)]
     )

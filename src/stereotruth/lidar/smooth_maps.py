@@ -1,11 +1,10 @@
 """Smooth maps of three coordinates as polynomials, one for each patch of a lattice.
 
-Patches follow from the lattice alone and a polynomial from its patch alone, so that a point comes
-out the same in any file, chunk or window. A patch is fitted to the exact map at its nodes, by sums
-in a fixed order, and checked at other points up to its corners; where one that misses its tolerance
-is needed, the exact map itself is asked. :class:`PatchedTransform` undoes map projections, in some
-6 ns a point instead of PROJ's 130 to 900; :class:`LocalProjection` takes the ground to epipolar
-pixels, in a tenth of the model's time.
+A patch follows from the lattice and a polynomial from its patch alone, so that a point comes out
+the same in any file, chunk or window. It is fitted to the exact map at its nodes and checked at
+others up to its corners; where it misses its tolerance the exact map itself is asked.
+:class:`PatchedTransform` undoes map projections, in 6 ns a point instead of PROJ's 130 to 900;
+:class:`LocalProjection` takes the ground to epipolar pixels, in a tenth of the model's time.
 """
 
 from __future__ import annotations
@@ -18,12 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from .lattice import CELL_BITS, LATTICE_DEG, LATTICE_M, PER_DEG, PER_M
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 Exact = Callable[[Floats, Floats, Floats], tuple[Floats, Floats, Floats]]
 
 PATCH_M, SLAB_M = 500.0, 1000.0

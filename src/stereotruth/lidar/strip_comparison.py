@@ -1,14 +1,9 @@
 """Strips of a site's LiDAR compared where they overlap: what each is off from the others.
 
-A cell of the point stores is divided into squares. Where the single returns of a strip in a square
-lie on a plane, the plane is taken; where two strips have one, the planes differ by
-
-    d = dz - g · (dx, dy),
-
-with (dx, dy, dz) the offset of the second strip from the first and g the slope of the ground or
-roof (ASPRS, "Guidelines on Geometric Inter-Swath Accuracy and Quality of Lidar Data", 2018; Latypov
-2002). One adjustment of all pairs of the site gives each strip's offset from the one with most
-ground. Points are read once, cell by cell.
+Where two strips have a plane of single returns in a square, these differ by d = dz - g · (dx, dy),
+with the offset (dx, dy, dz) of the second strip and the slope g (ASPRS, "Guidelines on Geometric
+Inter-Swath Accuracy and Quality of Lidar Data", 2018; Latypov 2002). One adjustment of all pairs
+gives each strip's offset from the one with most ground. See docs/explanation/real_sensors.md.
 """
 
 from __future__ import annotations
@@ -23,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from ..core.numerics.arrays import Floats, Ints
 from ..core.numerics.geometry import DEGREE_M, exact_metres_per_degree
 from ..core.numerics.statistics import robust_sigma, tukey_weights
 from .lattice import CELL_BITS, CELL_DEG, LATTICE_DEG, LATTICE_M
@@ -30,9 +26,6 @@ from .point_fields import BIN_S, EDGES, SOURCE, TIME, runs_of
 from .point_store import SQUARES as CELL_SQUARES
 from .point_store import Points, PointStore
 from .strips import SHARE, Strip, StripKey, StripOffsets, more_of
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LEAST_SHARE = 0.002  # of a cell's points: fewer are compared with nothing
 SQUARES = (64, 32, 16)  # along a side of a cell, of 1.8, 3.7, 7.3 m; as small as points allow

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import exact_metres_per_degree
 from ..core.products.files import atomic_folder, read_record, sealed
 from .cell_sort import SCRATCH_POINTS, SortedRuns, bounds_of
@@ -31,7 +32,6 @@ from .point_fields import EDGES, NO_LIMITS, SOURCE, day_of
 from .point_store import SQUARES, PointStore
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 
 RECORD, SHARES = "strips.json", "shares.npy"
 MOST_TOLD = 8  # strips in a sentence

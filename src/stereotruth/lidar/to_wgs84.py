@@ -1,17 +1,14 @@
 """From the coordinates of a LiDAR file to WGS 84 longitude, latitude and ellipsoidal height.
 
-Three things decide what a LAS coordinate means, and each is settled here or refused by name:
-the horizontal system with its unit, the unit of the heights, and the surface that the heights
-count from. Sources: LAS 1.4 R16 (ASPRS), section "Coordinate Reference System"; OGC GeoTIFF 1.1.
+The horizontal system with its unit, the unit of the heights, and the surface that they count from
+are settled here or refused by name (LAS 1.4 R16, "Coordinate Reference System"; OGC GeoTIFF 1.1).
 
-- Orthometric heights H need a geoid grid: h = H + N. It counts from the frame of the file, so that
-  it comes before the change of frame. Nothing is ever downloaded.
-- Heights whose surface is declared nowhere are orthometric if a geoid is given, else ellipsoidal;
-  but a file whose name carries the name of a vertical datum (``..._IGN69.laz``) needs the geoid.
-- Map projections are undone by polynomials that are checked against PROJ (:mod:`.smooth_maps`); a
-  coordinate may come out one step of 1e-9 degree beside PROJ's.
-- Which datum transformation is best depends on the place: on the whole degrees of longitude and
-  latitude that the points' own extent touches, whatever box the header states.
+- Orthometric heights H need a geoid grid, h = H + N, before the change of frame. Nothing is ever
+  downloaded. Heights of no declared surface are orthometric if a geoid is given, else ellipsoidal;
+  but a file whose name carries that of a vertical datum (``..._IGN69.laz``) needs the geoid.
+- Map projections are undone by polynomials that are checked against PROJ (:mod:`.smooth_maps`).
+- Which datum transformation is best is asked for the whole degrees of longitude and latitude that
+  the points' own extent touches, whatever box the header states.
 """
 
 from __future__ import annotations

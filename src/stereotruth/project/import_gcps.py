@@ -124,7 +124,7 @@ def import_gcps(
     except InputError:
         to.unlink()
         raise
-    both = int((read.in_left & read.in_right).sum())
+    both = int(np.logical_and(*read.seen).sum())
     return [*lines, *notes, f"{to}: {len(read.ids)} points, {both} of them in both views"]
 
 

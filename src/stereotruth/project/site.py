@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 
 from ..align.control_points import images_measured
-from ..align.images import GivenImage, open_image
+from ..align.images import open_image
 from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.products.remote_files import bring_image, is_remote
@@ -36,7 +36,7 @@ def open_row(row: Image) -> OpenedImage:
     """An image of the sheet. Raises InputError if it or its RPC cannot be used."""
     file = bring_image(row.file) if is_remote(row.file) else Path(row.file)
     cells = row.acquired, row.sun_azimuth, row.sun_elevation
-    image, delivery = open_image(GivenImage.of(row.image, file, *cells))
+    image, delivery = open_image(row.image, file, *cells)
     return OpenedImage(row, file, image, delivery)
 
 

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..core.numerics.arrays import Floats
 
 Place = tuple[float, float]  # longitude, latitude, degrees
 Sun = tuple[float, float]  # azimuth from north over east, elevation, degrees
@@ -31,17 +32,8 @@ Sun = tuple[float, float]  # azimuth from north over east, elevation, degrees
 # Files that are read with an image, by GDAL's names: after its whole name, after its stem; and of
 # DIMAP deliveries RPC_*.XML, of both views.
 AFTER_NAME = (".msk", ".aux.xml", ".ovr", ".msk.ovr", ".imd", ".rpb")
-AFTER_STEM = (
-    "_rpc.txt",
-    ".rpb",
-    ".imd",
-    ".xml",
-    ".rpc",
-    ".aux",
-    ".aux.xml",
-    ".tab",
-    ".wld",
-    ".rrd",
+AFTER_STEM = tuple(
+    ["_rpc.txt", ".rpb", ".imd", ".xml", ".rpc", ".aux", ".aux.xml", ".tab", ".wld", ".rrd"]
 )
 ANYWHERE = re.compile(r"rpc_.*\.xml", re.DOTALL)
 # Names of suppliers for the views along the track (GaoFen-7, ZY-3; Cartosat-1 has BANDA aft, BANDF
@@ -58,19 +50,13 @@ OTHERS = re.compile(
 IMD_TIME = ("firstLineTime", "TLCTime", "earliestAcqTime")
 IMD_SUN = (("meanSunAz", "meanSunEl"), ("sunAz", "sunEl"))
 TAGS = {  # of XML in lower case: DIMAP 1 to 3 (Airbus), GaoFen products, and IMD as XML (Vantor)
-    "time": (
-        "imaging_time",
-        "centertime",
-        "scenecentertime",
-        "firstlinetime",
-        "starttime",
-        "tlctime",
-    ),
+    "time": ("imaging_time", "centertime", "scenecentertime", "firstlinetime", "starttime",
+             "tlctime"),
     "date": ("imaging_date",),
     "azimuth": ("sun_azimuth", "solarazimuth", "sunazimuth", "meansunaz", "sunaz"),
     "elevation": ("sun_elevation", "solarelevation", "sunelevation", "meansunel", "sunel"),
     "zenith": ("solarzenith", "sunzenith"),
-}
+}  # fmt: skip
 
 MAX_BYTES = 5_000_000  # of a file beside an image
 MOST_FILES = 200  # beside an image that are looked into
@@ -335,7 +321,7 @@ def sun_over(time: datetime, lon: float, lat: float) -> Sun:
     return math.degrees(azimuth) % 360.0, math.degrees(elevation)
 
 
-def toward_sun(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
+def toward_sun(azimuth_deg: float, elevation_deg: float) -> Floats:
     """Unit vector [3] (east, north, up) toward the sun."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     level = math.cos(elevation)

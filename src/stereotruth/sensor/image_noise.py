@@ -1,18 +1,15 @@
 """Noise of two images of the same ground, images in which it is the same everywhere, their detail.
 
-Noise is not one number (docs/explanation/real_sensors.md): it follows the brightness, and its
-neighbours may correlate, of which one image alone tells too little.
-
 1. *By brightness*: second differences along rows and columns (Immerkaer, CVIU 64, 1996), where an
    image is flattest at each brightness, give the noise but for a factor, the same at all.
 2. *The factor*: parts of the left image are looked for along their rows in the right one. Where the
    ground is flat, noise is all that both images differ by.
-3. *Equal noise*: brightness is counted in standard deviations of the noise, so that it is the same
-   at all places and in all images: a variance-stabilising transformation (Anscombe 1948).
+3. *Equal noise*: brightness is counted in standard deviations of the noise: a
+   variance-stabilising transformation (Anscombe 1948).
 
-The *detail* of an image is what remains of it where shadows and another sun change its brightness:
-each pixel's deviation from the mean of the pixels around it, in standard deviations of these and of
-the noise. Only at a shadow's edge is it another than on lit ground, by GREATEST at most.
+The *detail* is each pixel's deviation from the mean of those around it, in standard deviations of
+these and of the noise, which shadows and another sun leave as it is. See
+docs/explanation/real_sensors.md.
 """
 
 from __future__ import annotations
@@ -24,12 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from ..core.numerics.windows import window_sums
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 STEPS = 8.0  # whole numbers that a standard deviation of the noise spans in images of equal noise
 EQUAL = STEPS**2, STEPS**2  # variances of the noise of two such images
@@ -236,9 +229,7 @@ def _by_brightness(brightness: Floats, _greatest: Floats, rough: Floats) -> Nois
     return NoiseCurve(tuple(levels), tuple(deviations))
 
 
-def detail(
-    image: NDArray[np.floating], noise: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def detail(image: NDArray[np.floating], noise: float) -> tuple[Singles, Singles]:
     """Detail [h, w] of an image [h, w] of whole numbers (DN), by the variance of its ``noise``; and
     the share of it that is signal, over the SIGNAL_PX² around each pixel.
 

@@ -25,6 +25,7 @@ from rasterio.windows import Window
 
 from ..core.config.configuration import Rectify
 from ..core.errors import InputError
+from ..core.numerics.arrays import Bools, Ints, Singles
 from ..core.products.file_parts import open_stream
 from ..core.products.rasters import MASK, Hidden, open_raster, refuse_bands
 from ..core.products.remote_files import size_of
@@ -183,9 +184,7 @@ class Source:
             self._opened.append(opened[path])
         return opened[path]
 
-    def read_layers(
-        self, col: int, row: int, cols: int, rows: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def read_layers(self, col: int, row: int, cols: int, rows: int) -> tuple[Singles, Bools]:
         """Image and colour bands [1 + colours, rows, cols] of a window, and which are masked.
 
         Pixels [rows, cols] that only the file ``mask`` hides have their values.
@@ -203,14 +202,14 @@ class Source:
             hidden = hidden | masked
         return values, hidden
 
-    def read(self, col: int, row: int, cols: int, rows: int) -> NDArray[np.float32]:
+    def read(self, col: int, row: int, cols: int, rows: int) -> Singles:
         """Window [rows, cols] from (col, row) on; must lie in the image."""
         values, hidden = self.read_layers(col, row, cols, rows)
         if self.mask_path is not None:
             values[0][hidden] = np.nan
         return values[0]
 
-    def _values(self, raw: NDArray[Any], hidden: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def _values(self, raw: NDArray[Any], hidden: Bools) -> Singles:
         """Image and colour bands of the ``raw`` ones; NaN where the image has no value."""
         values, missing = raw.astype(np.float32), hidden.copy()
         if self.nodata is not None:  # a band may be dark where others are not
@@ -373,7 +372,7 @@ def _places_of_blocks(dataset: rasterio.DatasetReader) -> tuple[NDArray, NDArray
     return offsets, counts
 
 
-def _pixel_bytes(dataset: rasterio.DatasetReader, blocks: int) -> tuple[NDArray[np.int64], int]:
+def _pixel_bytes(dataset: rasterio.DatasetReader, blocks: int) -> tuple[Ints, int]:
     """Bytes that the pixels of each block take at least [blocks], and those of a full one.
 
     Of a last strip, those of its rows alone; some programs write it in full.

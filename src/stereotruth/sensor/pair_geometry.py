@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import exact_metres_per_degree
 from .rpc import SensorModel
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 MIN_CONVERGENCE = 1.0  # degrees
 LEAST_BASE = 1e-5  # difference of two unit rays; with less, both images look from one place
@@ -178,7 +175,10 @@ class GroundOfImages:
 
         Raises InputError if an RPC reaches no ground there.
         """
-        pixels = [_pixel_deg(*image) for image in zip(self.sensors, self.sizes)]
+        pixels = [
+            pixel_deg(sensor, cols / 2, rows / 2, float(sensor.rpc.height_off))
+            for sensor, (cols, rows) in zip(self.sensors, self.sizes)
+        ]
         return min(pixels, key=lambda pixel: pixel[::-1])
 
     def shows(self, lon: Floats, lat: Floats, height: Floats) -> Bools:
@@ -213,9 +213,11 @@ class GroundOfImages:
         return out
 
 
-def _pixel_deg(sensor: SensorModel, size: tuple[int, int]) -> tuple[float, float]:
-    col, row = size[0] / 2, size[1] / 2
-    height = float(sensor.rpc.height_off)
+def pixel_deg(sensor: SensorModel, col: float, row: float, height: float) -> tuple[float, float]:
+    """(lon, lat) size in degrees of a square on level ground, of the area of a pixel.
+
+    At an ellipsoidal ``height`` in m. Raises InputError if the RPC reaches no ground there.
+    """
     lon, lat = sensor.localize([col, col + 1, col], [row, row, row + 1], height)
     if not np.isfinite(lon).all():
         raise InputError(

@@ -4,11 +4,9 @@ Image coordinates are (col, row) = (sample, line) with (0, 0) at the centre of t
 ground coordinates are WGS 84 longitude, latitude in degrees and ellipsoidal height in metres.
 RPC00B and the order of its 20 terms: NGA STDI-0002, Appendix E.
 
-Every line of a pushbroom image is taken at its own time, with its own roll and pitch. The
-correction by line moves a whole line along its columns and across them, for an attitude that
-jitters, which no RPC follows. It is no part of the kernels: they know the smooth sensor, and the
-correction is added where a position in the image itself is asked for. So all polynomials of the
-smooth sensor stay as exact as they are.
+The correction by line moves a whole line along its columns and across them, for an attitude that
+jitters. The kernels know the smooth sensor alone; the correction is added where a position in the
+image itself is asked for, so that all polynomials of the smooth sensor stay exact.
 """
 
 from __future__ import annotations
@@ -18,13 +16,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import continuous
 from ..core.numerics.interpolation import cubic_weights
-
-Floats = NDArray[np.float64]
 
 # The packed form: ten offsets and scales, coefficients, the affine.
 SAMP_NUM, SAMP_DEN, LINE_NUM, LINE_DEN, AFFINE = 10, 30, 50, 70, 90

@@ -1,18 +1,13 @@
 """Pairs of images: what they share, under which light, how they rank, which images they link.
 
 All follows from RPCs and times alone, before anything is matched. The angles are those by which
-pairs are chosen in the field: convergence, elevation of the bisector and asymmetry of both rays
-(Jeong and Kim 2014, ISPRS J. 92; Ames Stereo Pipeline, asp_plot), and the difference of the sun's
-direction, which decides most for pairs of two dates (Qin 2019, ISPRS J. 147). Images count as
-diachronic where the shadow of an ordinary building ends elsewhere in them, or where a season lies
-between them (docs/explanation/real_sensors.md).
+pairs are chosen in the field (Jeong and Kim 2014, ISPRS J. 92; Ames Stereo Pipeline, asp_plot; Qin
+2019, ISPRS J. 147); what counts as diachronic: docs/explanation/real_sensors.md.
 
 Pairs rank by the information about heights that a pixel is expected to give: the share of pixels
 that can be matched, times ½ log₂(1 + (RELIEF_M / height_sigma_m)²) bits (Shannon 1949). The log
-odds of a match fall with the base over the height, with the way of the shadows and with the
-roughness of the site (:func:`stereotruth.lidar.point_statistics.roughness_m`), as far as its LiDAR
-has been read. The coefficients are fitted and tested on other sites by ``bench/pairs.py``
-(docs/stack.md).
+odds of a match fall with the base, the way of the shadows and the roughness of the site, by
+coefficients that ``bench/pairs.py`` fits and tests (docs/stack.md).
 """
 
 from __future__ import annotations
@@ -23,14 +18,13 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import DEGREE_M
 from .deliveries import Acquisition, between_suns, shadow_shift
-from .pair_geometry import frame, inside, ray_upwards, view_order
+from .pair_geometry import frame, inside, pixel_deg, ray_upwards, view_order
 from .rpc import SensorModel
 
-Floats = NDArray[np.float64]
 Names = tuple[str, str]  # of a pair's images
 
 SAMPLES = 65  # along each side of an image, of the ground that it shares
@@ -148,7 +142,7 @@ def pair_of(one: SiteImage, other: SiteImage, height: float) -> SitePair | None:
     places = (one.sensor, col, row), (other.sensor, *there)
     rays = tuple(ray_upwards(*place, height) for place in places)
     left, right = order(one, other, overlap, rays, height)
-    pixels = [_pixel_m(*place, height) for place in places]
+    pixels = [pixel_deg(*place, height)[1] * DEGREE_M for place in places]
     areas = [image.size[0] * image.size[1] * pixel**2 for image, pixel in zip((one, other), pixels)]
     ground = float(seen.mean()) * areas[0]
     convergence, bisector, asymmetry = angles_of(rays)
@@ -173,15 +167,6 @@ def pair_of(one: SiteImage, other: SiteImage, height: float) -> SitePair | None:
 def _days(one: datetime | None, other: datetime | None) -> float | None:
     """Between two times; None if one is not known."""
     return None if one is None or other is None else abs((one - other) / timedelta(days=1))
-
-
-def _pixel_m(sensor: SensorModel, col: float, row: float, height: float) -> float:
-    """Side of the square that has the area of a pixel on level ground, m."""
-    lon, lat = sensor.localize([col - 5, col + 5, col, col], [row, row, row - 5, row + 5], height)
-    east = DEGREE_M * math.cos(math.radians(lat[0]))
-    across = (lon[1] - lon[0]) * east, (lat[1] - lat[0]) * DEGREE_M
-    along = (lon[3] - lon[2]) * east, (lat[3] - lat[2]) * DEGREE_M
-    return math.sqrt(abs(across[0] * along[1] - across[1] * along[0])) / 10.0
 
 
 def order(

@@ -23,13 +23,14 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, in_number
+from ..core.errors import InputError, in_number, install_extra
 from ..core.products.files import files_below, plain_name, read_sealed
 from ..core.products.provenance import file_sha256
 from ..core.products.rasters import read_disparity, read_image, read_labels
@@ -182,7 +183,7 @@ class StereoTiles:
     numbers; ``disparity`` float32 [h, w], x_left − x_right in px, NaN where there is no label;
     ``mask`` bool [h, w], where there is one. ``transforms`` takes and returns such a dict.
 
-    Raises InputError if the split has no labelled pair.
+    Raises InputError if the split has no labelled pair, and without PyTorch.
     """
 
     def __init__(
@@ -194,6 +195,8 @@ class StereoTiles:
         layout: str = "stereotruth",
         nodata: float = -999.0,
     ) -> None:
+        if find_spec("torch") is None:
+            raise InputError("StereoTiles needs PyTorch", remedy=install_extra("networks"))
         self.dataset = StereoDataset(Path(root).name, root, layout, (-(2**15), 2**15), nodata)
         self.pairs = self.dataset.pairs(split, labelled=True)
         self.transforms = transforms

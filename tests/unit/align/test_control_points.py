@@ -33,8 +33,8 @@ def test_files_of_spreadsheets_are_read(tmp_path):
     assert points.lon.tolist() == [115.3, 115.1]
     assert points.height.tolist() == [70.0, 50.0]
     assert points.left[1].tolist() == [1.5, 2.5]
-    assert points.in_left.tolist() == [False, True]
-    assert points.in_right.tolist() == [True, False]
+    assert points.seen[0].tolist() == [False, True]
+    assert points.seen[1].tolist() == [True, False]
 
 
 PAIR = ("one", "two")
@@ -96,7 +96,7 @@ def test_the_long_form_gives_a_pair_the_points_that_it_shows(tmp_path):
     assert points.ids == ("A", "B")
     assert points.left.tolist() == [[3.5, 4.5], [7.0, 8.0]]
     assert points.right[0].tolist() == [1.5, 2.5]
-    assert points.in_right.tolist() == [True, False]
+    assert points.seen[1].tolist() == [True, False]
     assert points.line == (2, 4)
     assert images_measured(file) == {"one": 2, "two": 3, "three": 5}
     file.write_text(f"{HEAD}\nA,{ROW}\n")

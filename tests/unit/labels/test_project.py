@@ -24,7 +24,7 @@ from stereotruth.labels.project import FAR_BEYOND, project_scene
 from stereotruth.labels.recipe import label_window
 from stereotruth.labels.scene_inputs import SceneInputs
 from stereotruth.lidar.ingest import ingest
-from stereotruth.lidar.point_store import query_points
+from stereotruth.lidar.point_store import PointStore, query_points
 
 from ...synthetic.box_scene import (
     ROOF,
@@ -84,7 +84,7 @@ def brute_force(scene: Scene, on_surface: bool) -> dict[tuple[int, int], tuple[f
 
     With ``on_surface``, only pixels around which all points are of one surface.
     """
-    points = query_points([scene.store], -180, -90, 180, 90)
+    points = query_points([PointStore(scene.store)], -180, -90, 180, 90)
     xy = scene.model.ground_to_epipolar(points.lon, points.lat, points.height)
     steps = np.rint(xy * 65536) / 65536  # as places are added up
     steps = np.stack([steps[0], steps[1], steps[0] - steps[2]])
