@@ -56,7 +56,7 @@ MOST_BYTES = {"figures": 600_000, "thumbnails": 24_000, "sliders": 200_000}  # o
 COVERAGE_PX, FIGURE_PX, THUMBNAIL_PX, SLIDER_PX = 2200, 1400, 320, 900
 KINDS = ("left", "right", "disparity", "status")
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
-CHANGED, MISFIT = Status.CHANGED.label, "does_not_fit_the_images"
+CHANGED, MISFIT = Status.CHANGED.label, "changed_(does_not_fit_the_images)"
 FILES = ("left", "right", "disp", "status", "orientation")  # columns of the manifest
 FIRST = ("tile", "quality", "scene", "split", "class", "labelled_share")  # and these come first
 

@@ -281,5 +281,5 @@ def test_the_page_works_in_a_browser_without_a_network(made, tmp_path, width):
 
 def test_what_cannot_have_changed_is_named_so():
     row = {"count_changed": "9", "count_labelled": "1", "count_masked": ""}
-    assert page.status_counts(row) == {"does_not_fit_the_images": 9, "labelled": 1}
+    assert page.status_counts(row) == {page.MISFIT: 9, "labelled": 1}
     assert page.status_counts(row | {"lidar_days_left": "300"}) == {"changed": 9, "labelled": 1}
