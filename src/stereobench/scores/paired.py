@@ -75,19 +75,14 @@ def difference(first: Sequence[Sums], second: Sequence[Sums]) -> Difference:
         for sign, begin, end in ((-1, 0, len(first)), (1, len(first), len(runs)))
         if end > begin
     ]
-    n = len(tiles)
-    value = fsum(sign * fsum(means[r] for r in side) / len(side) for sign, side in sides)
-    shares = [
-        fsum(sign * fsum(parts[r][t] for r in side) / len(side) for sign, side in sides)
-        for t in range(n)
-    ]
-    by_tile = [
-        fsum(
-            sign * fsum(runs[r][tile][1] / runs[r][tile][0] for r in side) / len(side)
-            for sign, side in sides
-        )
-        for tile in tiles
-    ]
+
+    def second_less_first(of: Sequence[float]) -> float:
+        """Of a value of each run: the mean of the second's runs less that of the first's."""
+        return fsum(sign * fsum(of[r] for r in side) / len(side) for sign, side in sides)
+
+    n, value = len(tiles), second_less_first(means)
+    shares = [second_less_first([part[t] for part in parts]) for t in range(n)]
+    by_tile = [second_less_first([of[name][1] / of[name][0] for of in runs]) for name in tiles]
     better = round(sum(of < 0 for of in by_tile) / n, 6)
     if n < MIN_TILES:
         return Difference(n, round(value, 6), None, None, better)
@@ -148,16 +143,14 @@ def read_sums(folder: str | Path, columns: Mapping[str, tuple[str, str]]) -> dic
 
 def _columns_of(folder: str | Path) -> dict[str, tuple[str, str]]:
     """The figures that a folder of scores has by tile."""
-    if (Path(folder) / "tiles.csv").is_file():
+    if Path(folder, "tiles.csv").is_file():
         return {
             "height off steps, m": ("points", "mean_absolute_m"),
             "edges, m": ("edges", "position_error_m"),
             "resolution of edges, m": ("edges", "resolution_m"),
         }
-    rows = (
-        read_table(Path(folder) / "scores.csv") if (Path(folder) / "scores.csv").is_file() else ()
-    )
-    names = next(iter(rows), {})
+    scores = Path(folder, "scores.csv")
+    names = next(read_table(scores), {}) if scores.is_file() else {}
     d1 = [name for name in names if name.startswith("filled_d1_")]
     return {"EPE, px": ("labelled", "filled_epe_px"), **{n: ("labelled", n) for n in d1}}
 

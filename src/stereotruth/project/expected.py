@@ -162,9 +162,8 @@ def check_labels(
     per_m2 = float(density[covered].mean())
     per_px, recipe = per_m2 * pixel_m2(nodes.model), settings.project.recipe
     expected = expected_share(per_px, recipe)
-    found.say(
+    found.fact(
         "labels",
-        Level.FACT,
         f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel, on {100 * share:.0f} % of "
         f"what both images show: some {100 * expected:.0f} % of the pixels that neither image "
         f"hides will have a label (project.recipe: {recipe}), "
@@ -186,9 +185,8 @@ def _say_holes(
     _, group, sizes, _ = cv2.connectedComponentsWithStats(empty.astype(np.uint8), connectivity=4)
     largest = group == 1 + int(np.argmax(sizes[1:, cv2.CC_STAT_AREA]))
     lon, lat = (float(values[largest].mean()) for values in ground)
-    found.say(
+    found.fact(
         "LiDAR",
-        Level.FACT,
         f"{area / 1e6:.3f} km² of what both images show lie in no file's bounds and get no label, "
         f"most of it around longitude {lon:.5f}, latitude {lat:.5f}",
     )
@@ -271,31 +269,28 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
     seconds += JOB_S * sum(JOBS + fact.lidar_files for fact in facts)
     needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels)
     free = shutil.disk_usage(Path.cwd()).free
-    found.say(
+    found.fact(
         "time",
-        Level.FACT,
         f"about {duration(seconds / max(cores or 1, 1))} on the {cores} cores of this machine, "
         "from nothing to tiles",
     )
     if needed > free:
-        found.say(
+        found.fault(
             "disk",
-            Level.ERROR,
             f"{_gb(needed)} are needed in {Path.cwd()}, {_gb(free)} are free",
             "make space, or work in a folder on a larger disk",
         )
     else:
-        found.say("disk", Level.FACT, f"{_gb(needed)} of the {_gb(free)} that are free")
+        found.fact("disk", f"{_gb(needed)} of the {_gb(free)} that are free")
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if memory < MEMORY:
-        found.say(
+        found.doubt(
             "memory",
-            Level.DOUBT,
             f"{_gb(memory)} in all, jobs ask for up to {_gb(MEMORY)}",
             "run with --cores 1",
         )
     else:
-        found.say("memory", Level.FACT, f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
+        found.fact("memory", f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
 
 
 def _gb(count: float) -> str:

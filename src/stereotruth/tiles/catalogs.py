@@ -42,16 +42,12 @@ IMAGES = {"left": "left epipolar image", "right": "right epipolar image"}
 TIFF, JSON, TEXT = "image/tiff", "application/json", "text/plain"
 CROISSANT = "croissant.json"
 URL = "https://doi.org/10.1109/TGRS.2023.3245205"
+TEXT_FIELD = mlc.DataType.TEXT
 COLUMNS = {
-    "tile": mlc.DataType.TEXT,
-    "city": mlc.DataType.TEXT,
-    "scene": mlc.DataType.TEXT,
-    "split": mlc.DataType.TEXT,
+    **dict.fromkeys(("tile", "city", "scene", "split"), TEXT_FIELD),
     "right_offset_px": mlc.DataType.INTEGER,
     "labelled_share": mlc.DataType.FLOAT,
-    "left": mlc.DataType.TEXT,
-    "right": mlc.DataType.TEXT,
-    "disp": mlc.DataType.TEXT,
+    **dict.fromkeys(("left", "right", "disp"), TEXT_FIELD),
 }
 KINDS = {
     "left": ("left", "left epipolar image, the reference"),

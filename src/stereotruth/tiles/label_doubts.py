@@ -231,11 +231,6 @@ def doubts(biases: Iterable[Bias], probability: float | None) -> list[Doubt]:
     return found
 
 
-def surface_figures(biases: Iterable[Bias]) -> dict[str, Any]:
-    """By surface, JSON-ready."""
-    return {bias.surface.replace(" ", "_"): bias.to_dict() for bias in biases}
-
-
 class Miss(NamedTuple):
     """A gate that was missed: its name in the configuration, the value found, the limit."""
 

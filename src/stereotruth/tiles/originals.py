@@ -257,25 +257,19 @@ def _crop(
         rpc = RPC.from_dict(record["corrected_rpc"])
         rpc = replace(rpc, samp_off=rpc.samp_off - low[0], line_off=rpc.line_off - low[1])
         options = {
+            "driver": "GTiff",
+            "width": cols,
+            "height": rows,
+            "count": source.count,
+            "dtype": source.dtypes[0],
+            "nodata": source.nodata,
             "photometric": "RGB" if source.colorinterp[0] == ColorInterp.red else "MINISBLACK",
             "compress": "deflate",
             "predictor": 1 if source.dtypes[0].startswith("float") else 2,
             "tiled": True,
         }
-        with (
-            rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
-            open_raster(
-                out,
-                "w",
-                driver="GTiff",
-                width=cols,
-                height=rows,
-                count=source.count,
-                dtype=source.dtypes[0],
-                nodata=source.nodata,
-                **options,
-            ) as target,
-        ):
+        masked = rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True)
+        with masked, open_raster(out, "w", **options) as target:
             window = Window(*low, cols, rows)
             target.write(source.read(window=window))
             if MaskFlags.per_dataset in source.mask_flag_enums[0]:
