@@ -167,6 +167,7 @@ def compare_folders(first: Sequence[Path], second: Sequence[Path]) -> list[str]:
                 f"{figure}: no tile in common", file=second[0], remedy="score on the same tiles"
             )
         said = "level" if found.level else "better" if found.value < 0 else "worse"
+        said = "too few tiles to tell" if found.low is None else said
         numbers = [found.value, *([] if found.low is None else [found.low, found.high])]
         value, *ends = (minus(f"{v:+.4f}") for v in numbers)
         reach = f" [{', '.join(ends)}]" if ends else ""
@@ -204,8 +205,16 @@ def differences(methods: Sequence[Row], folders: Sequence[Sequence[str | Path]])
     named = [{"name": f"{row['method']} minus {row['less']}", **row} for row in rows]
     caption = (
         f"Difference of {FILLED}, with {CONFIDENCE:.0%} confidence from the differences by tile: "
-        "negative where the first of the two is better, level where the interval holds 0."
+        "negative where the first of the two is better, level where the interval holds 0. Fewer "
+        f"than {MIN_TILES} tiles have no interval and tell nothing apart."
     )
-    told = [{**row, "said": "level" if row["level"] else "told apart"} for row in named]
+    told = [{**row, "said": _in_words(row)} for row in named]
     shown = of_figures(told, {"name": "Methods"}, figures, {"said": "in EPE"})
     return Table("differences", title, rows, [(caption, shown)])
+
+
+def _in_words(row: Row) -> str:
+    """Whether a difference in EPE is more than chance."""
+    if row["epe_px_low"] is None:
+        return "too few tiles"
+    return "level" if row["level"] else "told apart"

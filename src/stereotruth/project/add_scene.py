@@ -103,7 +103,9 @@ def _in_folders(folders: Sequence[Path]) -> tuple[list[Path], list[str]]:
         raise InputError(
             f"{len(wanted)} images that may be of the pair: {there}",
             file=folders[0],
-            remedy="name the two: stereotruth scene add LEFT RIGHT --lidar …",
+            remedy="name the two: stereotruth scene add LEFT RIGHT --lidar …; list more than two "
+            "of a place in images.tsv (key images of config.yaml), and let stereotruth pairs "
+            "choose",
         )
     return wanted, lines
 

@@ -279,8 +279,8 @@ def _hold_against_gcps(
             "heights",
             f"{len(off)} of {here} GCPs lie {'below' if shift < 0 else 'above'} every LiDAR point "
             f"of their files, by {abs(shift):.1f} m in the middle",
-            "check the LiDAR's vertical datum and unit (geoid, feet), and that the GCPs' heights "
-            "are ellipsoidal metres",
+            "check the LiDAR's vertical datum and unit (a geoid that is missing, or of the other "
+            "sign: its heights are added; feet), and that the GCPs' heights are ellipsoidal metres",
         )
 
 

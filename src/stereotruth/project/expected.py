@@ -34,7 +34,8 @@ LABELLED = {
 POINT_S, PX_S, COVERED_PX_S, SCENE_S, JOB_S = 9.6e-7, 1.2e-6, 9.8e-6, 60.0, 8.0
 JOBS = 5  # of a scene, beside one for each LiDAR file
 POINT_BYTES, PX_BYTES = 12.0, 24.0  # on the disk
-SPARE = 1.2  # of the disk: logs, records, blocks in the making
+SPARE = 1.2  # of the disk: blocks in the making
+RECORDS_BYTES = 2e8  # logs, pages, what Snakemake notes
 MEMORY = 4.0e9  # that rules of the way to tiles ask for
 SUPPORT_PX = 2.0  # around a place, of an image that is resampled by cubic convolution
 NODES = 128  # along the longer side of the grid
@@ -187,7 +188,7 @@ def _say_holes(
     lon, lat = (float(values[largest].mean()) for values in ground)
     found.fact(
         "LiDAR",
-        f"{area / 1e6:.3f} km² of what both images show lie in no file's bounds and get no label, "
+        f"{_area(area)} of what both images show lie in no file's bounds and get no label, "
         f"most of it around longitude {lon:.5f}, latitude {lat:.5f}",
     )
 
@@ -267,7 +268,7 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
     covered = sum(fact.pixels * fact.covered for fact in facts)
     seconds = POINT_S * points + PX_S * pixels + COVERED_PX_S * covered + SCENE_S * len(facts)
     seconds += JOB_S * sum(JOBS + fact.lidar_files for fact in facts)
-    needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels)
+    needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels) + RECORDS_BYTES
     free = shutil.disk_usage(Path.cwd()).free
     found.fact(
         "time",
@@ -291,6 +292,10 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
         )
     else:
         found.fact("memory", f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
+
+
+def _area(m2: float) -> str:
+    return f"{m2 / 1e6:.3f} km²" if m2 >= SMALL_HOLE_M2 else f"{m2:.0f} m²"
 
 
 def _gb(count: float) -> str:

@@ -73,10 +73,12 @@ def write_stac(
     orientations: Mapping[str, Path],
     footprints: Mapping[str, Mapping[str, Any]],
     acquired: Mapping[str, str],
+    licence: str,
 ) -> None:
     """Write the collection of the dataset in ``folder``; adds its files to the manifest's ``rows``.
 
-    ``orientations`` and ``footprints`` by tile, ``acquired``: dates by scene. Raises InputError for
+    ``orientations`` and ``footprints`` by tile, ``acquired``: dates by scene.
+    ``licence`` of the dataset. Raises InputError for
     what is no date.
     """
     root = folder / FOLDER
@@ -98,7 +100,7 @@ def write_stac(
         "stereotruth",
         "Epipolar pairs of satellite images with ground-truth disparity",
         pystac.Extent(pystac.SpatialExtent([whole]), pystac.TemporalExtent([span])),
-        license="other",
+        license=licence,
         keywords=["satellite stereo", "disparity", "LiDAR"],
         summaries=pystac.Summaries({f"{PREFIX}:split": sorted({row["split"] for row in rows})}),
     )
@@ -173,7 +175,7 @@ def _raster(
     RasterExtension.ext(asset, add_if_missing=True).apply(bands)
 
 
-def write_croissant(folder: Path) -> None:
+def write_croissant(folder: Path, licence: str) -> None:
     """Describe the dataset in ``folder``, whose manifest is written."""
     manifest = mlc.FileObject(
         id="manifest",
@@ -210,6 +212,7 @@ def write_croissant(folder: Path) -> None:
         name="stereotruth",
         description="Epipolar pairs of satellite images with ground-truth disparity",
         url=URL,
+        license=[licence],
         distribution=[manifest, *files],
         record_sets=[pairs],
     )

@@ -46,6 +46,8 @@ README = """Stereo pairs with ground-truth disparity, in the folder layout of WH
 
 {counts}
 
+Licence: {licence}
+
 Conventions
 - left: the reference; right: the other view; which of them looks backward is said in orientation.
   uint16, nodata 0. Rows correspond: the match of left pixel (x, y) is right pixel (x - d, y).
@@ -98,11 +100,12 @@ def assemble_dataset(
     *,
     catalogs: Sequence[str] = (),
     acquired: Mapping[str, str] | None = None,
+    licence: str = "other",
 ) -> dict[str, Any]:
     """Copy the cities' tiles to ``out`` in the published layout, with a manifest and a README.
 
     ``catalogs``: stac, croissant, see :mod:`.catalogs`; ``acquired``:
-    dates by scene.
+    dates by scene; ``licence`` of the dataset.
 
     Each file is held against its manifest's checksum on the way. Tiles of split ``none`` (they
     share ground with two splits) stay behind. Returns counts by folder, and the pairs of tiles
@@ -145,11 +148,11 @@ def assemble_dataset(
         write_footprints(scratch, footprints.values())
         if rows and "stac" in catalogs:
             where = {row["tile"]: at / row["orientation"] for at, row, *_ in todo}
-            _catalogs("stac").write_stac(scratch, rows, where, footprints, acquired or {})
+            _catalogs("stac").write_stac(scratch, rows, where, footprints, acquired or {}, licence)
         if rows:
             write_table(scratch / "manifest.csv", rows)
         if rows and "croissant" in catalogs:
-            _catalogs("croissant").write_croissant(scratch)
+            _catalogs("croissant").write_croissant(scratch, licence)
         labelled = (row for _, row, _, kinds in todo if "disp" in kinds)
         largest = max((float(row["disparity_rounding_px"]) for row in labelled), default=0.0)
         text = README.format(
@@ -157,6 +160,7 @@ def assemble_dataset(
             nodata=" or ".join(sorted(nodata)),
             rounding=f"Stored values are rounded by at most {largest:.4f} px.",
             shared=f"Except: {shared}." if shared else "",
+            licence=licence,
         )
         (scratch / "README.txt").write_text(text, encoding="utf-8")
     for place, count in sorted(counts.items()):

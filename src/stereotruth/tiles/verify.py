@@ -85,6 +85,6 @@ def verify(folders: Iterable[str | Path]) -> dict[str, int]:
         more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
         raise InputError(
             f"{len(bad)} files differ from the manifests: {'; '.join(bad[:5])}{more}",
-            remedy="delete the folder and make it again with snakemake",
+            remedy="delete the folder and make it again (stereotruth run tiles/<City>)",
         )
     return counts
