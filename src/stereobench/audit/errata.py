@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from stereotruth.core.config.methods import AuditLimits
 from stereotruth.core.errors import InputError, in_number
 from stereotruth.core.job import progress
+from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.numerics.statistics import reweighted_fit, tukey_weights
 from stereotruth.core.products.files import (
     atomic_folder,
@@ -72,7 +73,6 @@ from .verdicts import FAULT, WRONG, Audited, judge
 
 log = logging.getLogger("stereotruth")
 
-Floats = NDArray[np.float64]
 Labels = NDArray[np.float32]  # [h, w] px, NaN: none
 
 ERRATA = "errata.json"

@@ -36,10 +36,10 @@ from stereotruth.align.least_squares_matching import (
     weighted_mean,
 )
 from stereotruth.core.kernels import inner, kernel
+from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.numerics.interpolation import cubic_slopes, cubic_weights
 from stereotruth.tiles import sift_matches
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 SMOOTHING_PX = 0.7  # standard deviation: what is left aliases by less than 0.01 px

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-Floats = NDArray[np.float64]
+from stereotruth.core.numerics.arrays import Floats
+
 SMALLEST_PX, LARGEST_PX = 1e-4, 1e4
 BINS = 4096
 SPAN = float(np.log(LARGEST_PX / SMALLEST_PX))

@@ -31,15 +31,13 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from stereotruth.core.numerics.arrays import Bools
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.products.rasters import read_flags
 from stereotruth.core.status import HIDDEN
 from stereotruth.tiles.manifest import Tile, column
 from stereotruth.tiles.orientation import PixelSize
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset, match_inside
-
-Bools = NDArray[np.bool_]
-
 
 NEAR_PX = 5
 STEP_PX = 3.0

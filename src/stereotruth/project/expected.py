@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..core.config.configuration import Configuration
 from ..core.errors import in_number
+from ..core.numerics.arrays import Bools
 from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.windows import summed_area, window_sums
 from ..epipolar.model import EpipolarModel
@@ -41,8 +42,6 @@ SUPPORT_PX = 2.0  # around a place, of an image that is resampled by cubic convo
 NODES = 128  # along the longer side of the grid
 SMALL_HOLE_M2, SMALL_HOLE = 10_000, 0.001  # rims that are not worth a line: area, and share
 BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

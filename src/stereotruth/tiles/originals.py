@@ -30,6 +30,7 @@ from rasterio.windows import Window
 
 from ..core.errors import InputError
 from ..core.job import progress
+from ..core.numerics.arrays import Floats
 from ..core.products.files import atomic_folder, write_table
 from ..core.products.grids import require_complete
 from ..core.products.provenance import file_sha256
@@ -43,7 +44,6 @@ from .cameras import Crop, Pair, Pinhole, local_frame, write_colmap, write_eogs,
 from .manifest import NODATA, LayerKind, read_manifest
 from .orientation import evaluate
 
-Floats = NDArray[np.float64]
 NO_CELLS = ("", None, None), ("", None, None)
 
 MARGIN_PX = 16  # of the crops around what the tiles show

@@ -29,6 +29,7 @@ from rasterio.enums import ColorInterp
 from scipy.ndimage import distance_transform_edt
 
 from ..core.errors import in_number
+from ..core.numerics.arrays import Floats
 from ..core.products.rasters import read_disparity, read_image
 from ..core.status import BY_LABEL
 from ..pages import pictures
@@ -38,7 +39,6 @@ from .manifest import FOOTPRINTS, STYLE
 if TYPE_CHECKING:
     from .scene_stores import SceneStores
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 CONTACT_TILES = 16  # most tiles on the contact sheet

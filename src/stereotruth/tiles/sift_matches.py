@@ -38,12 +38,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.interpolation import bilinear
 from ..pages.pictures import stretch
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 
 
 WINDOW = 5  # px
