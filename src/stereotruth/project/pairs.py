@@ -194,7 +194,9 @@ def write_pairs(
         sheets.check(cells | here, sheets.Scene, f"scene {name}")
         append_row(rows, cells | here)
         written += 1
-    return f"{rows}: {written} of {len(rated)} pairs written. Next: stereotruth check {city}"
+    how = ", to link the images and to differ in convergence" if choice.most else ""
+    said = f"{rows}: {written} of {len(rated)} pairs written{how}"
+    return f"{said}. Next: stereotruth check {city}"
 
 
 def _free_name(pair: SitePair, scenes: dict[str, sheets.Scene]) -> str:
