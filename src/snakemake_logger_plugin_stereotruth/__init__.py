@@ -13,11 +13,13 @@ import os
 import statistics
 import sys
 import time
+from pathlib import Path
 
 from snakemake_interface_logger_plugins.base import LogHandlerBase
 from snakemake_interface_logger_plugins.common import LogEvent
 
 COLUMNS = "rule", "jobs", "cores", "MB", "minutes"
+MOST_OF_REASON = 500  # characters
 RESOURCES = "mem_mb", "runtime"
 # Rules that name the products of others, and take no time.
 WITHOUT_JOB = {"all", "benchmark", "closure", "evaluate", "heights", "index", "predict", "report"}
@@ -112,12 +114,22 @@ class LogHandler(LogHandlerBase):
         from stereotruth.core.job import failure_file
 
         self.failed = True
-        if not any(failure_file(log).exists() for log in record.log):
-            logs = ", ".join(map(str, record.log)) or "no log"
-            begun, _ = self.jobs.get(record.jobid, (record, 0.0))
+        if any(failure_file(log).exists() for log in record.log):
+            return
+        begun, _ = self.jobs.get(record.jobid, (record, 0.0))
+        name = record.rule_name if begun is record else _name(begun)
+        if reason := record.rule_msg:  # of what runs the job, such as SLURM
+            self._say(f"Failed: {name}. {reason.strip()[:MOST_OF_REASON]}")
+        elif logs := [log for log in map(Path, record.log) if _is_of(log, begun)]:
             self._say(
-                f"Failed: {_name(begun)}, and does not say why, as a job that is killed for its "
-                f"memory or its time. Look at {logs}"
+                f"Failed: {name}, and does not say why, as a job that is killed for its memory or "
+                f"its time. Look at {', '.join(map(str, logs))}"
+            )
+        else:
+            self._say(
+                f"Failed: {name}, without a log of its own, as a job that a cluster refuses for "
+                "its partition, account, memory or time: sbatch by hand, with the resources of the "
+                "profile, says why"
             )
 
     def _show_table(self) -> None:
@@ -139,6 +151,11 @@ class LogHandler(LogHandlerBase):
         table.add_row("all", str(sum(row[0] for row in rules.values())))
         wide(Console(file=self.stream, highlight=False)).print(table)
         self._say("Cores, MB and minutes: of one job, at most. This was a dry run")
+
+
+def _is_of(log: Path, begun: logging.LogRecord) -> bool:
+    """Whether a job's log was written since the job began."""
+    return log.is_file() and log.stat().st_mtime >= begun.created - 1.0
 
 
 def _name(record: logging.LogRecord) -> str:

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 HOUSE = ROOT / "src"
 TESTS = ROOT / "tests"
 MOST_LINES = 500  # of a file
-MOST_FILES = 240
+MOST_FILES = 239
 MOST_FUNCTION_LINES, MOST_PARAMETERS = 100, 10  # ``self`` and ``cls`` apart
 # Functions beyond, to be emptied: (lines, parameters).
 LONG_FUNCTIONS = {

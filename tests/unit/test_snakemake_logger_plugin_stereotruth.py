@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -45,6 +47,9 @@ def run(tmp_path, monkeypatch, capsys):
         return SimpleNamespace(tell=tell, said=said)
 
     return begin
+
+
+WITHOUT_REASON = {"rule_msg": None}  # as Snakemake has it of a job that has failed
 
 
 def job_of(number: int, rule: str, **resources: int) -> dict:
@@ -109,10 +114,24 @@ def test_a_job_that_dies_without_a_word_is_named_and_one_that_says_why_is_not(ru
         raise InputError("no points", file="a.csv", remedy="give some")
     (told,) = capsys.readouterr().err.splitlines()[1:]
     assert "no points" in told
-    now.tell("JOB_ERROR", logging.ERROR, **job_of(1, "align"))
-    now.tell("JOB_ERROR", logging.ERROR, **job_of(2, "align"))
+    now.tell("JOB_ERROR", logging.ERROR, **job_of(1, "align") | WITHOUT_REASON)
+    Path("logs/align/2.log").touch()
+    now.tell("JOB_ERROR", logging.ERROR, **job_of(2, "align") | WITHOUT_REASON)
     (line,) = now.said()
     assert "logs/align/2.log" in line
+
+
+def test_the_reason_of_a_cluster_is_told_and_no_log_of_an_earlier_run(run):
+    now = run()
+    Path("logs/align").mkdir(parents=True)
+    Path("logs/align/1.log").touch()
+    os.utime("logs/align/1.log", (0, 0))
+    now.tell("JOB_ERROR", logging.ERROR, **job_of(1, "align") | WITHOUT_REASON)
+    refused = job_of(2, "align") | {"rule_msg": "sbatch: error: invalid partition"}
+    now.tell("JOB_ERROR", logging.ERROR, **refused)
+    silent, told = now.said()
+    assert "logs/align/1.log" not in silent
+    assert told == "Failed: align. sbatch: error: invalid partition"
 
 
 def test_jobs_of_a_run_say_warnings_and_progress_and_one_of_them_that_it_compiles(run, capsys):

@@ -118,7 +118,7 @@ def in_process(monkeypatch, capsys, *arguments: str) -> Run:
 def test_errors_of_what_is_not_there(own, monkeypatch, capsys):
     monkeypatch.chdir(own)
     run = in_process(monkeypatch, capsys, "status", "Qichun")
-    assert run.status == 1 and run.text.startswith("error: ") and "no city 'Qichun'" in run.text
+    assert run.status == 1 and run.text.startswith("error: ") and "Qichun" in run.text
     run = in_process(monkeypatch, capsys, "open")
     assert run.status == 1 and "no page" in run.text
 

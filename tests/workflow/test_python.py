@@ -46,10 +46,11 @@ def said(outputs: list[dict]) -> list[str]:
     return "".join(texts).splitlines()
 
 
-def test_the_notebook_says_what_it_shows(folder: Path) -> None:
+def test_the_notebook_says_what_it_shows(folder: Path, capsys: pytest.CaptureFixture) -> None:
     """And its labels are those of the workflow, to the last bit."""
     cells = code_cells(json.loads(NOTEBOOK.read_text(encoding="utf-8")))
     found = run_code(["".join(cell["source"]) for cell in cells], folder)
+    assert "Done: " in capsys.readouterr().err  # the run has told its progress
     for cell, outputs in zip(cells, found):
         assert agrees(said(outputs), said(cell["outputs"])), said(outputs)
         assert len(outputs) == len(cell["outputs"])

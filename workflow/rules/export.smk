@@ -104,12 +104,12 @@ rule dataset:
         runtime=60,
     params:
         sources=upstream("dataset"),
-        catalogs={
+        described={
             "catalogs": list(SETTINGS.dataset.catalogs),
             "acquired": SETTINGS.dataset.acquired,
+            "licence": SETTINGS.dataset.licence,
         },
         layouts=[name for name in SETTINGS.dataset.layouts if name != "whu"],
-        licence=SETTINGS.dataset.licence,
         code=source_digest("stereotruth.tiles.layouts"),
     message:
         "Putting the cities together in the layout of the published dataset"

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -68,7 +68,7 @@ def audit(
     shared = find_shared([_load_features(work / f"{pair.name}.npz") for pair in pairs])
     common = _sharing(pairs, measured, shared)
     audited = [
-        Audited(pair, figures, [*judge(figures, settings, len(pairs)), *common[k]])
+        Audited(pair, figures, [*_changed(pair), *judge(figures, settings, len(pairs)), *common[k]])
         for k, (pair, figures) in enumerate(zip(pairs, measured))
     ]
     summary = summarise(dataset, audited, shared, settings)
@@ -117,6 +117,12 @@ def _measure_all(
     with ThreadPoolExecutor(workers) as pool:
         done = pool.map(one, pairs)
         return list(progress(done, len(pairs), f"{dataset.name}: pairs measured"))
+
+
+def _changed(pair: Pair) -> Iterator[Finding]:
+    """Files of a pair that are not those which the manifest or the seal has the checksums of."""
+    for error in pair.changed():
+        yield Finding("files", FAULT, f"{Path(str(error.file)).name} {error.problem}")
 
 
 def _load_features(path: Path) -> Features:

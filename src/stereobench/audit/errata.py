@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from stereotruth.core.config.methods import AuditLimits
 from stereotruth.core.errors import InputError, in_number
 from stereotruth.core.job import progress
+from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.numerics.statistics import reweighted_fit, tukey_weights
 from stereotruth.core.products.files import (
     atomic_folder,
@@ -52,6 +53,8 @@ from stereotruth.core.products.rasters import (
     read_labels,
     write_tiff,
 )
+from stereotruth.tiles.manifest import disparity_cells, refuse_changed
+from stereotruth.tiles.quick_looks import NUMBERS, read_footprints, write_footprints
 from stereotruth.tiles.stereo_dataset import StereoDataset
 
 from .estimates import SMALLEST_SCALE, cells, robust_fit, share
@@ -70,7 +73,6 @@ from .verdicts import FAULT, WRONG, Audited, judge
 
 log = logging.getLogger("stereotruth")
 
-Floats = NDArray[np.float64]
 Labels = NDArray[np.float32]  # [h, w] px, NaN: none
 
 ERRATA = "errata.json"
@@ -262,7 +264,8 @@ def write_errata(
         for a in progress(faulty, len(faulty), f"{dataset.name}: labels mended"):
             name, file = a.pair.name, a.pair.disparity
             job = None
-            if {f.check for f in a.of(FAULT)} & set(MENDED) and "bias" in a.figures:
+            checks = {f.check for f in a.of(FAULT)}
+            if checks & set(MENDED) and "files" not in checks and "bias" in a.figures:
                 job = _Mending(dataset, a, limits, len(audited))
             if job is None or file is None or not job.mend():
                 others[name] = [f.text for f in a.of(FAULT)]
@@ -310,8 +313,10 @@ def read_errata(delta: str | Path) -> dict[str, Any]:
 def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int:
     """Copy ``dataset`` to the new folder ``out`` with its labels corrected; how many files are.
 
-    Files are found by name, wherever they lie, and held against their checksums before anything is
-    written. A manifest beside them gets the new checksums.
+    Files are found by name, wherever they lie. They are held against the checksums of the errata,
+    and all that a manifest lists against those of the manifest, before anything is written. The
+    copy's manifest tells of the corrected labels; ``export.json``, which seals the one before,
+    stays behind.
 
     Raises InputError if a file is missing or another one, if the errata are not as they were
     written, or if there is something at ``out``.
@@ -319,6 +324,7 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
     delta, dataset, out = Path(delta), Path(dataset), Path(out)
     refuse_others(out, source=dataset)
     said = read_errata(delta)
+    none = np.nan if said["nodata"] is None else said["nodata"]
     files, found = [file for file in files_below(dataset) if not is_foreign(file.name)], {}
     for record in said["tiles"]:
         name = Path(path_below(record["disparity"], "the file of a pair", delta / ERRATA)).name
@@ -331,29 +337,42 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
                 remedy="get the version of the dataset that was audited, or audit this one",
             )
         found[file] = record
+    if (dataset / "manifest.csv").is_file():
+        refuse_changed(dataset)
+        files = [file for file in files if file != dataset / "export.json"]
     with atomic_folder(out) as scratch:
         for file in progress(files, len(files), f"{out}: files"):
             target = scratch / file.relative_to(dataset)
             target.parent.mkdir(parents=True, exist_ok=True)
             if file in found:
-                _write_corrected(file, target, found[file], delta, said["nodata"])
+                _write_corrected(file, target, found[file], delta, none)
             else:
                 shutil.copyfile(file, target)
         if (manifest := scratch / "manifest.csv").is_file():
             changed = {file.relative_to(dataset).as_posix() for file in found}
             rows = list(read_table(manifest))
-            for row in (row for row in rows if row.get("disp") in changed):
-                row["disp_sha256"] = file_sha256(scratch / row["disp"])
+            renewed = [row for row in rows if row.get("disp") in changed]
+            places = read_footprints(scratch) if renewed else {}
+            for row in renewed:
+                file = scratch / row["disp"]
+                cells = disparity_cells(read_disparity(file, none))
+                row |= {"disp_sha256": file_sha256(file)}
+                row |= {name: cell for name, cell in cells.items() if name in row}
+                if place := places.get(row.get("tile", "")):
+                    numbers = {name: float(cells[name]) for name in NUMBERS if cells[name]}
+                    place["properties"] |= dict.fromkeys(NUMBERS) | numbers
             write_table(manifest, rows)
+            if places:
+                write_footprints(scratch, places.values())
     log.info("%s: labels of %s corrected", out, in_number(len(found), "pair"))
     return len(found)
 
 
 def _write_corrected(
-    file: Path, target: Path, record: Mapping[str, Any], delta: Path, nodata: float | None
+    file: Path, target: Path, record: Mapping[str, Any], delta: Path, nodata: float
 ) -> None:
     """Write the labels of a file as its errata have them, with the nodata value of the file."""
-    labels = read_disparity(file, np.nan if nodata is None else nodata)
+    labels = read_disparity(file, nodata)
     corrected = Correction(*(record[name] for name in Correction._fields)).apply(labels)
     if "mask" in record:
         mask = delta / path_below(record["mask"], "a mask", delta / ERRATA)
@@ -367,5 +386,5 @@ def _write_corrected(
         cv2.imwrite(str(target), stored)
     else:
         tag = read_labels(file)[1]
-        none = next((value for value in (tag, nodata) if value is not None), np.nan)
+        none = nodata if tag is None else tag
         write_tiff(target, np.where(known, corrected, np.float32(none)), nodata=tag)

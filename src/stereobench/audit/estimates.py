@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.numerics.statistics import (
     TUKEY,
     biweight,
@@ -23,9 +24,6 @@ from stereotruth.core.numerics.statistics import (
     robust_sigma,
     tukey_weights,
 )
-
-Floats = NDArray[np.float64]
-
 
 SMALLEST_SCALE = 0.02  # px: less is no noise of a match
 CELLS = 8  # along the longer side of what was measured; each of

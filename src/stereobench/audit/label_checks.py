@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stereotruth.core.numerics.arrays import Bools, Floats
 from stereotruth.epipolar.surface_windows import shifted_correlations, surface_correlation
 from stereotruth.epipolar.warping import warp_rows
 from stereotruth.epipolar.window_sums import BEND, SURFACE_PX
@@ -21,8 +22,6 @@ from stereotruth.epipolar.window_sums import BEND, SURFACE_PX
 from .estimates import NOTHING, Estimate, cells, location, ratio, share
 from .matches import Matches
 
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 Labels = NDArray[np.floating]  # [h, w] px, NaN: none
 Picture = NDArray[np.float32]
 

@@ -36,11 +36,10 @@ from stereotruth.align.least_squares_matching import (
     weighted_mean,
 )
 from stereotruth.core.kernels import inner, kernel
+from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.numerics.interpolation import cubic_slopes, cubic_weights
-from stereotruth.pages.pictures import stretch
 from stereotruth.tiles import sift_matches
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 SMOOTHING_PX = 0.7  # standard deviation: what is left aliases by less than 0.01 px
@@ -292,7 +291,7 @@ def match_pair(
     Rows may be some 40 px off as a whole, and 5 px around that. ``nodata``: 0 is no grey value.
     """
     a, b = grey(left), grey(right)
-    points = sift_matches.key_points(a), sift_matches.key_points(b)
+    points = tuple(sift_matches.key_points(sift_matches.picture_of(image)) for image in (a, b))
     if not (points[0].x.size and points[1].x.size):
         return least_squares(a, b, np.empty((0, 4)))
     best: tuple[Any, Any] = sift_matches.match(*points, (-reach_px, reach_px))
@@ -344,7 +343,7 @@ class Shared:
 
 def features(image: NDArray[Any]) -> Features:
     """Features of an image [h, w] or [h, w, 3]."""
-    picture = stretch(grey(image), percent=(0.1, 99.9))
+    picture = sift_matches.picture_of(grey(image))
     found, vectors = cv2.SIFT_create(nfeatures=FEATURES).detectAndCompute(picture, None)
     if not found:
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float16), picture.shape)

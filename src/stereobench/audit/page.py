@@ -178,7 +178,7 @@ def _checks(summary: Mapping[str, Any]) -> Table | None:
         )
         for name, counts in summary["checks"].items()
     ]
-    return Table.of(("what a pair must have", "failed", "too few matches"), lines)
+    return Table.of(("what may be wrong", "pairs", "too few matches"), lines)
 
 
 def _shared(summary: Mapping[str, Any]) -> Table | None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.products.rasters import read_image, read_labels
 from stereotruth.epipolar.warping import warp_rows
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
@@ -19,7 +20,6 @@ from .label_checks import AS_STATED, LARGER, SIGN, SMALLER, SWAPPED, SWAPPED_SIG
 from .matches import Matches, grey, label_offsets, match_pair, smooth
 
 Picture = NDArray[np.float32]
-Floats = NDArray[np.float64]
 Labels = NDArray[np.float32]  # [h, w] px, NaN: none
 
 

@@ -32,16 +32,16 @@ GAIN = 0.15  # of the squared difference beside steps, by which a move must make
 WRONG = 0.25  # share of wrong labels among those of one frequent value
 NEGLIGIBLE = 1e-3  # share of labels outside the range
 MIN_GREY_VALUES = 8  # of an image
-CHECKS = {  # what a pair must have, in the order of the page
-    "files": "files that fit together",
-    "rows": "rows that correspond",
-    "convention": "sign and sides as stated",
-    "bias": "labels free of offset",
-    "registration": "labels on the pixels that they belong to",
-    "values": "values as stated",
-    "contradicted": "labels that the images bear out",
-    "hidden": "labels on visible pixels only",
-    "shared": "ground in one split only",
+CHECKS = {  # what is wrong with a pair that fails, in the order of the page
+    "files": "files do not fit together, or are not those of the manifest",
+    "rows": "rows do not correspond",
+    "convention": "sign or sides are not as stated",
+    "bias": "labels are offset",
+    "registration": "labels lie beside the pixels that they belong to",
+    "values": "values are not as stated",
+    "contradicted": "the images contradict labels",
+    "hidden": "labels lie on hidden pixels",
+    "shared": "ground lies in two splits, or a pair twice in the dataset",
 }
 TO_EDGES = {
     "": "",
@@ -347,7 +347,7 @@ def statements(summary: Mapping[str, Any]) -> list[str]:
     ]
     for check, counts in summary["checks"].items():
         if counts[FAULT]:
-            found.append(f"{_pairs(counts[FAULT])} without {CHECKS[check]}.")
+            found.append(f"{_pairs(counts[FAULT])}: {CHECKS[check]}.")
     for name, what in (
         ("parallax_px", "Vertical parallax"),
         ("label_bias_px", "Label - match of the images"),

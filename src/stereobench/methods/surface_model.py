@@ -36,6 +36,7 @@ from rasterio.transform import from_origin
 from stereotruth.core.errors import InputError
 from stereotruth.core.job import block_progress
 from stereotruth.core.kernels import inner, kernel
+from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.numerics.geometry import Three, plane_slopes, row_span
 from stereotruth.core.products.files import atomic_file
 from stereotruth.core.products.grids import Layer, blocks, require_complete
@@ -46,7 +47,6 @@ from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.sensor.rpc import SensorModel
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 
 
 MAX_STEP_PX = 1.5  # of disparity between neighbours: slopes of 66° with GF-7's 1 px per m

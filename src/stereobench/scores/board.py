@@ -26,13 +26,12 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import Field
 
 from stereotruth import __version__
 from stereotruth.core.config.methods import Name, Scoring, StereoDatasetEntry
-from stereotruth.core.config.section import FilePath, Section, Text, check
+from stereotruth.core.config.section import FilePath, Section, Text, check, read_mapping
 from stereotruth.core.errors import InputError, in_number
 from stereotruth.core.products.files import atomic_folder, link
 from stereotruth.pages.page import write_page
@@ -118,7 +117,7 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
     ``take_in``: admit what has not been before and is not refused. Raises InputError if the
     settings or a dataset cannot be used: a label is not as its manifest or its seal has it.
     """
-    settings = _settings(folder)
+    settings = check(read_mapping(folder / SETTINGS), BoardSettings, folder / SETTINGS)
     places = sorted(path for path in (folder / "submissions").glob("*") if path.is_dir())
     known = read_admitted(folder)
     admitted = known | (offered(folder, [p.name for p in places], known) if take_in else {})
@@ -145,19 +144,6 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
     with atomic_folder(to or folder / "site") as site:
         _write(site, settings, [of for of in tables.values() if of.methods], refused)
     return [f"{of['file']}: {of['problem']}. Remedy: {how}" for of, how in zip(refused, remedies)]
-
-
-def _settings(folder: Path) -> BoardSettings:
-    file = folder / SETTINGS
-    try:
-        given = yaml.safe_load(file.read_text(encoding="utf-8"))
-        if not isinstance(given, dict):
-            raise ValueError("no keys")
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        said = " ".join(str(error).split()) or type(error).__name__
-        problem = f"no settings of a board ({said})"
-        raise InputError(problem, file=file, remedy="write title and datasets into it") from None
-    return check(given, BoardSettings, file)
 
 
 def _table(folder: Path, name: str, settings: BoardSettings) -> Table:
@@ -193,14 +179,14 @@ def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
     entry.check_maps(dataset, table.pairs)
     work = folder / WORK / dataset.name / entry.name
     maps, scores = work / "maps", work / "scores"
-    place = entry.submission.folder
-    program = [place / name for name in entry.submission.files] if entry.program else []
+    place = entry.folder
+    program = [place / name for name in entry.files] if entry.program else []
     settings = entry.settings(work / "program")
     predict(dataset, split, entry.name, settings, maps, work=work / "pairs", files=program)
     label = entry.facts["label"]
     summary = score(dataset, split, label, maps, scores, table.plan, products=table.products)
-    if program and entry.submission.scores:
-        hold_against(entry.submission.scores, summary)
+    if program and entry.scores:
+        hold_against(entry.scores, summary)
     shown = ((p.name, read_prediction(maps, p), table.truth(p)) for p in table.pairs)
     entry.refuse_doubts(summary["doubts"], dataset, shown)
     return Run(entry, summary, maps, scores)

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-Floats = NDArray[np.float64]
+from stereotruth.core.numerics.arrays import Floats
+
 SMALLEST_PX, LARGEST_PX = 1e-4, 1e4
 BINS = 4096
 SPAN = float(np.log(LARGEST_PX / SMALLEST_PX))
@@ -77,6 +78,9 @@ class Confidence:
             return {"pixels": 0}
         stated, oracle = (_area(sums) for sums in (self._by_sigma, self._by_error))
         mean = self._by_error[1].sum() / self.count
+        # the error in units of its uncertainty that ONE_SIGMA of the pixels are below
+        place = np.searchsorted(np.cumsum(self._ratio), ONE_SIGMA * self.count)
+        factor = float(SMALLEST_PX * np.exp((place + 0.5) * SPAN / BINS))
         width = self._sigma / self.count
         row: dict[str, float | None] = {
             "pixels": self.count,
@@ -87,18 +91,13 @@ class Confidence:
             if mean > oracle
             else None,
             "mean_uncertainty_px": round(width, 6),
-            "calibration_factor": round(self._factor(), 6),
+            "calibration_factor": round(factor, 6),
         }
         for level, within in zip(LEVELS, self._within):
             name = f"interval_{100 * level:g}_percent"
             row[f"{name}_coverage_share"] = round(within / self.count, 6)
             row[f"{name}_mean_width_px"] = round(2 * _k(level) * width, 6)
         return row
-
-    def _factor(self) -> float:
-        """The error in units of its uncertainty that :data:`ONE_SIGMA` of the pixels are below."""
-        place = np.searchsorted(np.cumsum(self._ratio), ONE_SIGMA * self.count)
-        return float(SMALLEST_PX * np.exp((place + 0.5) * SPAN / BINS))
 
 
 def _k(level: float) -> float:

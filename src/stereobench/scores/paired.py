@@ -75,19 +75,14 @@ def difference(first: Sequence[Sums], second: Sequence[Sums]) -> Difference:
         for sign, begin, end in ((-1, 0, len(first)), (1, len(first), len(runs)))
         if end > begin
     ]
-    n = len(tiles)
-    value = fsum(sign * fsum(means[r] for r in side) / len(side) for sign, side in sides)
-    shares = [
-        fsum(sign * fsum(parts[r][t] for r in side) / len(side) for sign, side in sides)
-        for t in range(n)
-    ]
-    by_tile = [
-        fsum(
-            sign * fsum(runs[r][tile][1] / runs[r][tile][0] for r in side) / len(side)
-            for sign, side in sides
-        )
-        for tile in tiles
-    ]
+
+    def second_less_first(of: Sequence[float]) -> float:
+        """Of a value of each run: the mean of the second's runs less that of the first's."""
+        return fsum(sign * fsum(of[r] for r in side) / len(side) for sign, side in sides)
+
+    n, value = len(tiles), second_less_first(means)
+    shares = [second_less_first([part[t] for part in parts]) for t in range(n)]
+    by_tile = [second_less_first([of[name][1] / of[name][0] for of in runs]) for name in tiles]
     better = round(sum(of < 0 for of in by_tile) / n, 6)
     if n < MIN_TILES:
         return Difference(n, round(value, 6), None, None, better)
@@ -148,16 +143,14 @@ def read_sums(folder: str | Path, columns: Mapping[str, tuple[str, str]]) -> dic
 
 def _columns_of(folder: str | Path) -> dict[str, tuple[str, str]]:
     """The figures that a folder of scores has by tile."""
-    if (Path(folder) / "tiles.csv").is_file():
+    if Path(folder, "tiles.csv").is_file():
         return {
             "height off steps, m": ("points", "mean_absolute_m"),
             "edges, m": ("edges", "position_error_m"),
             "resolution of edges, m": ("edges", "resolution_m"),
         }
-    rows = (
-        read_table(Path(folder) / "scores.csv") if (Path(folder) / "scores.csv").is_file() else ()
-    )
-    names = next(iter(rows), {})
+    scores = Path(folder, "scores.csv")
+    names = next(read_table(scores), {}) if scores.is_file() else {}
     d1 = [name for name in names if name.startswith("filled_d1_")]
     return {"EPE, px": ("labelled", "filled_epe_px"), **{n: ("labelled", n) for n in d1}}
 
@@ -174,6 +167,7 @@ def compare_folders(first: Sequence[Path], second: Sequence[Path]) -> list[str]:
                 f"{figure}: no tile in common", file=second[0], remedy="score on the same tiles"
             )
         said = "level" if found.level else "better" if found.value < 0 else "worse"
+        said = "too few tiles to tell" if found.low is None else said
         numbers = [found.value, *([] if found.low is None else [found.low, found.high])]
         value, *ends = (minus(f"{v:+.4f}") for v in numbers)
         reach = f" [{', '.join(ends)}]" if ends else ""
@@ -211,8 +205,16 @@ def differences(methods: Sequence[Row], folders: Sequence[Sequence[str | Path]])
     named = [{"name": f"{row['method']} minus {row['less']}", **row} for row in rows]
     caption = (
         f"Difference of {FILLED}, with {CONFIDENCE:.0%} confidence from the differences by tile: "
-        "negative where the first of the two is better, level where the interval holds 0."
+        "negative where the first of the two is better, level where the interval holds 0. Fewer "
+        f"than {MIN_TILES} tiles have no interval and tell nothing apart."
     )
-    told = [{**row, "said": "level" if row["level"] else "told apart"} for row in named]
+    told = [{**row, "said": _in_words(row)} for row in named]
     shown = of_figures(told, {"name": "Methods"}, figures, {"said": "in EPE"})
     return Table("differences", title, rows, [(caption, shown)])
+
+
+def _in_words(row: Row) -> str:
+    """Whether a difference in EPE is more than chance."""
+    if row["epe_px_low"] is None:
+        return "too few tiles"
+    return "level" if row["level"] else "told apart"

@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +119,7 @@ class Submission:
     facts: Mapping[str, Any]
 
     @classmethod
-    def of(cls, folder: Path) -> Submission | None:
+    def of(cls, folder: Path) -> Self | None:
         """That of a folder of results; None if it is none. Raises InputError if it is spoilt."""
         file = folder / FILE
         if not file.is_file():

@@ -20,56 +20,40 @@ TABLE5 = {
     "psmnet": (2.481, 24.81, 614),
     "hmsmnet": (1.672, 12.94, 511),
 }
-TABLE6 = {
-    "Shaoguan": {
-        "sgm": (7.862, 63.19),
-        "stereonet": (2.660, 24.58),
-        "psmnet": (2.514, 21.45),
-        "hmsmnet": (2.091, 16.94),
-    },
-    "Kunming": {
-        "sgm": (3.065, 37.50),
-        "stereonet": (1.225, 6.09),
-        "psmnet": (1.181, 5.77),
-        "hmsmnet": (1.017, 4.44),
-    },
-    "Yingde": {
-        "sgm": (5.497, 47.22),
-        "stereonet": (1.821, 14.69),
-        "psmnet": (1.993, 15.09),
-        "hmsmnet": (1.436, 9.86),
-    },
-    "Qichun": {
-        "sgm": (4.484, 54.19),
-        "stereonet": (2.801, 34.63),
-        "psmnet": (2.953, 37.04),
-        "hmsmnet": (1.596, 13.65),
-    },
-    "Wuhan": {
-        "sgm": (6.790, 58.65),
-        "stereonet": (4.836, 47.83),
-        "psmnet": (4.105, 36.49),
-        "hmsmnet": (3.905, 35.66),
-    },
-    "Hengyang": {
-        "sgm": (9.081, 61.82),
-        "stereonet": (4.375, 43.50),
-        "psmnet": (3.761, 31.23),
-        "hmsmnet": (2.914, 23.43),
-    },
-}
-TABLE7 = {
-    "Shaoguan": {"stereonet": (2.467, 23.26), "psmnet": (2.366, 20.61), "hmsmnet": (1.928, 15.67)},
-    "Kunming": {"stereonet": (1.245, 6.19), "psmnet": (1.091, 4.86), "hmsmnet": (0.996, 5.05)},
-    "Yingde": {"stereonet": (1.758, 13.52), "psmnet": (1.481, 9.96), "hmsmnet": (1.351, 8.72)},
-    "Qichun": {"stereonet": (2.760, 34.07), "psmnet": (2.817, 35.05), "hmsmnet": (1.483, 12.09)},
-    "Wuhan": {"stereonet": (4.346, 42.88), "psmnet": (4.025, 34.92), "hmsmnet": (3.718, 34.51)},
-    "Hengyang": {"stereonet": (3.885, 39.18), "psmnet": (3.553, 34.85), "hmsmnet": (2.539, 19.62)},
-}
+
+
+def _by_city(text: str) -> dict[str, dict[str, tuple[float, float]]]:
+    """EPE and D1 by city and kind of method, of a table with a city in a line."""
+    (_, *kinds), *lines = (line.split() for line in text.strip().splitlines())
+    return {
+        city: dict(zip(kinds, zip(map(float, values[::2]), map(float, values[1::2]))))
+        for city, *values in lines
+    }
+
+
+TABLE6 = _by_city("""
+city            sgm       stereonet      psmnet        hmsmnet
+Shaoguan   7.862 63.19   2.660 24.58   2.514 21.45   2.091 16.94
+Kunming    3.065 37.50   1.225  6.09   1.181  5.77   1.017  4.44
+Yingde     5.497 47.22   1.821 14.69   1.993 15.09   1.436  9.86
+Qichun     4.484 54.19   2.801 34.63   2.953 37.04   1.596 13.65
+Wuhan      6.790 58.65   4.836 47.83   4.105 36.49   3.905 35.66
+Hengyang   9.081 61.82   4.375 43.50   3.761 31.23   2.914 23.43
+""")
+TABLE7 = _by_city("""
+city        stereonet      psmnet        hmsmnet
+Shaoguan   2.467 23.26   2.366 20.61   1.928 15.67
+Kunming    1.245  6.19   1.091  4.86   0.996  5.05
+Yingde     1.758 13.52   1.481  9.96   1.351  8.72
+Qichun     2.760 34.07   2.817 35.05   1.483 12.09
+Wuhan      4.346 42.88   4.025 34.92   3.718 34.51
+Hengyang   3.885 39.18   3.553 34.85   2.539 19.62
+""")
 
 PAPER = "Li et al., IEEE TGRS 2023, table 5"
 LATER = "READMEs of later networks"
-INVALID = "how pixels that SGM leaves invalid count, SGM's settings"
+LACKING = "pair list; whether labels beyond the range count"
+INVALID = "; how pixels that SGM leaves invalid count, SGM's settings"
 LITTLE = "pair list, range, mask, pooling; whether trained and scored by one program"
 ORDER = f"{LITTLE}; the networks are taken to stand in the order of those of WHU-Stereo"
 
@@ -95,16 +79,12 @@ class Published:
     not_known: str
 
 
-def _paper(kind: str, epe: float, d1: float) -> Published:
-    lacking = "pair list; whether labels beyond the range count"
-    return Published(
-        KINDS[kind].label, epe, d1, PAPER, f"{lacking}; {INVALID}" if kind == "sgm" else lacking
-    )
-
-
 PUBLISHED = {
     "whu-2023": (
-        *(_paper(kind, epe, d1) for kind, (epe, d1, _) in TABLE5.items()),
+        *(
+            Published(KINDS[kind].label, epe, d1, PAPER, LACKING + INVALID * (kind == "sgm"))
+            for kind, (epe, d1, _) in TABLE5.items()
+        ),
         Published("TGRNet", 1.586, 12.63, LATER, LITTLE),
         Published("RAFT-Stereo", 1.729, 14.12, LATER, LITTLE),
         Published("HMSM-Net, again", 2.040, 19.00, LATER, f"{LITTLE}; why not the paper's 1.672"),

@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereotruth.core.numerics.arrays import Bools, Floats
 from stereotruth.core.products.rasters import OFTEN
 
-Bools = NDArray[np.bool_]
 Disparity = NDArray[np.float32]  # [h, w] px, NaN: none
-Floats = NDArray[np.float64]
 
 ALL = "all"
 MIN_TILES = 5

@@ -31,15 +31,13 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from stereotruth.core.numerics.arrays import Bools
 from stereotruth.core.products.grids import require_complete
 from stereotruth.core.products.rasters import read_flags
 from stereotruth.core.status import HIDDEN
 from stereotruth.tiles.manifest import Tile, column
 from stereotruth.tiles.orientation import PixelSize
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset, match_inside
-
-Bools = NDArray[np.bool_]
-
 
 NEAR_PX = 5
 STEP_PX = 3.0
@@ -106,8 +104,12 @@ def label_strata(
 
     ``layers``: see :func:`layers_of`.
     """
-    layers = layers or {}
-    found = {"near_step": near_step(labels), **match_in_tile(labels)}
+    layers, inside = layers or {}, match_inside(labels)
+    found = {
+        "near_step": near_step(labels),
+        "match_inside": inside,
+        "match_outside": np.isfinite(labels) & ~inside,
+    }
     hidden = products.hidden(pair)
     if hidden is not None:
         found["near_occlusion"] = cv2.dilate(hidden.astype(np.uint8), _square()) > 0
@@ -152,12 +154,6 @@ def exact_truth(pair: Pair, products: Products) -> dict[str, NDArray[np.float32]
         f"exact_{name}": np.where(same & (grid[name][here] == 1), disparity, np.nan)
         for name in ("visible", "hidden")
     }
-
-
-def match_in_tile(labels: NDArray[np.float32]) -> dict[str, Bools]:
-    """Whether the right tile, of the same width, holds the match of each labelled pixel."""
-    inside = match_inside(labels)
-    return {"match_inside": inside, "match_outside": np.isfinite(labels) & ~inside}
 
 
 def near_step(labels: NDArray[np.float32]) -> Bools:

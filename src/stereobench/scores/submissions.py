@@ -13,7 +13,6 @@ from __future__ import annotations
 import shlex
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +40,15 @@ STATED = ("label", "by", "licence", "trained_on", "dataset")
 SEALED_REMEDY = "take the folder as it was admitted, or submit it anew under another name"
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A submission whose files are those that it states. ``name``: of its folder."""
-
-    name: str
-    submission: Submission
+class Entry(Submission):
+    """A submission whose files are those that it states."""
 
     @classmethod
     def read(cls, folder: Path, admitted: Mapping[str, str]) -> Entry:
         """The submission of a folder; raises InputError if it is none or was changed."""
         plain_name(folder.name, "the name of a submission,", folder)
         file = folder / FILE
-        found = Submission.of(folder)
+        found = cls.of(folder)
         if found is None:
             raise InputError("no submission", file=file, remedy="pack it: submission/<dataset>/…")
         if folder.name not in admitted:
@@ -67,19 +62,13 @@ class Entry:
                 what = "missing" if name in found.files else f"not a file that {FILE} names"
                 raise InputError(what, file=folder / name, remedy=SEALED_REMEDY)
             found.check([there[name]])
-        entry = cls(folder.name, found)
-        entry.check_facts()
-        return entry
+        found.check_facts()
+        return found
 
     @property
-    def facts(self) -> Mapping[str, Any]:
-        """What ``submission.json`` holds."""
-        return self.submission.facts
-
-    @property
-    def file(self) -> Path:
-        """Where it holds it."""
-        return self.submission.folder / FILE
+    def name(self) -> str:
+        """Of its folder."""
+        return self.folder.name
 
     @property
     def method(self) -> tuple[str, str]:
@@ -93,11 +82,10 @@ class Entry:
 
     def settings(self, work: Path) -> dict[str, Any]:
         """The entry of the method that takes its disparities, or runs a copy of its program."""
-        folder = self.submission.folder
         if not self.program:
-            return {"kind": FOLDER, "folder": str(folder)}
+            return {"kind": FOLDER, "folder": str(self.folder)}
         shutil.rmtree(work, ignore_errors=True)  # so that nothing it leaves there counts
-        shutil.copytree(folder, work)
+        shutil.copytree(self.folder, work)
         kept = {key: value for key, value in self.program.items() if key != "lock"}
         command = str(kept.get("command", "")).replace("{folder}", shlex.quote(str(work)))
         return {"kind": "command", **kept, "command": command}
@@ -112,25 +100,25 @@ class Entry:
             self.refuse("seed is no whole number", "write the seed of the training, or null")
         if not isinstance(self.program, dict):
             self.refuse("program is none", "give it command and lock")
-        if self.program and self.program.get("lock") not in self.submission.files:
+        if self.program and self.program.get("lock") not in self.files:
             self.refuse("the program has no lock file", "name it as program.lock, and in files")
 
     def refuse(self, problem: str, remedy: str, file: Path | None = None) -> None:
         """Raise InputError about a file, by default ``submission.json``."""
-        raise InputError(problem, file=file or self.file, remedy=remedy)
+        raise InputError(problem, file=file or self.folder / FILE, remedy=remedy)
 
     def check_maps(self, dataset: StereoDataset, pairs: Sequence[Pair]) -> None:
         """Raise InputError unless there is one map of disparities of each pair, and no other."""
         if self.program:
             return
-        folder, names = self.submission.folder, {pair.name for pair in pairs}
-        for name in self.submission.files:
+        names = {pair.name for pair in pairs}
+        for name in self.files:
             stem, dot, suffix = name.rpartition(".")
             if f"{dot}{suffix}" in SUFFIXES and stem.removesuffix(f"_{UNCERTAINTY}") not in names:
-                self.refuse("no pair of this split", "leave it out", folder / name)
+                self.refuse("no pair of this split", "leave it out", self.folder / name)
         for pair in pairs:
-            file = folder / f"{pair.name}.tif"
-            if file.name not in self.submission.files:
+            file = self.folder / f"{pair.name}.tif"
+            if file.name not in self.files:
                 self.refuse("missing: each pair counts", "submit all pairs of the split", file)
             with open_raster(file) as source:
                 raw, shape = source.read(), image_shape(pair.left)
@@ -153,7 +141,7 @@ class Entry:
                 of_map = Doubts(dataset.disparity_range)
                 of_map.add(found, truth)
                 if lines := of_map.lines():
-                    file = self.submission.folder / f"{name}.tif"
+                    file = self.folder / f"{name}.tif"
                     self.refuse(lines[0], "submit x_left − x_right, NaN where there is none", file)
             self.refuse(doubts[0], "submit x_left − x_right, NaN where there is none")
 
@@ -198,4 +186,4 @@ def refuse_borrowed(entry: Entry, earlier: Iterable[Entry]) -> None:
 
 def _maps(entry: Entry) -> set[str]:
     """Checksums of disparity maps."""
-    return {sha256 for name, sha256 in entry.submission.files.items() if name.endswith(SUFFIXES)}
+    return {sha256 for name, sha256 in entry.files.items() if name.endswith(SUFFIXES)}

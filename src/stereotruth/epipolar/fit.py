@@ -24,9 +24,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..sensor.pair_geometry import (
     convergence_angle,
     find_overlap,
@@ -39,7 +39,6 @@ from ..sensor.rpc import SensorModel, line_weights
 from .model import EpipolarModel, ImageModel, forward_with_slopes
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 Box = tuple[float, float, float, float]  # lon_min, lat_min, lon_max, lat_max, degrees
 Sizes = tuple[tuple[int, int], tuple[int, int]]  # (cols, rows) px of left and right image
 Models = tuple[ImageModel, ImageModel]  # of left and right image

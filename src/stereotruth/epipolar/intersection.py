@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import inner, kernel
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import DEGREE_M
 from ..sensor.rpc import project_point
 from .model import EpipolarModel, inverse_point
@@ -16,7 +17,6 @@ from .model import EpipolarModel, inverse_point
 if TYPE_CHECKING:
     import xarray as xr
 
-Floats = NDArray[np.float64]
 
 SYSTEM = "EPSG:4979"  # WGS 84: longitude, latitude, ellipsoidal height
 TOLERANCE_M = 1e-5

@@ -13,14 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Floats
 from ..core.numerics.interpolation import cubic_slopes, cubic_weights
 from ..core.products.files import atomic_file, read_record, sealed
 from ..sensor.rpc import LineCorrection, SensorModel, of_record, project_block, read_correction
 
-Floats = NDArray[np.float64]
 Four = tuple[float, float, float, float]
 
 COLOURS = ("red", "green", "blue")  # layers of rectified images in colour, beside `image`

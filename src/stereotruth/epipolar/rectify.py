@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.job import block_progress
+from ..core.numerics.arrays import Floats
 from ..core.numerics.interpolation import SIX_POINT_RADIUS
 from ..core.products.grids import Layer, Strip, blocks
 from ..core.products.provenance import digest, file_sha256, source_digest
@@ -31,7 +32,6 @@ from .model import COLOURS, EpipolarModel, ImageModel
 from .resampling import ANTIALIAS, KERNEL, resample
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
 
 
 SHARD = 1024  # px; one task writes one shard file

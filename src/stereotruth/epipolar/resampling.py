@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Floats
 from ..core.numerics.interpolation import (
     SIX_POINT_RADIUS,
     six_point_weights,
     six_point_weights_of_row,
 )
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.float32]
 
 

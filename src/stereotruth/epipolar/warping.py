@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Floats
 from ..core.numerics.interpolation import four_point_value
-
-Floats = NDArray[np.float64]
 
 
 @inlined

@@ -18,12 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from ..core.numerics.interpolation import four_point_weights
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 Runs = NDArray[np.int32]
 Image = NDArray[np.floating]
 

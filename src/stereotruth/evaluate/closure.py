@@ -28,12 +28,10 @@ from ..align.adjustment import estimate
 from ..align.alignment import Alignment, over_the_image, parameters_of, rpc_prior
 from ..align.records import PairEquations, SiteLines, read_equations
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.numerics.interpolation import between_four
 from ..core.products.grids import blocks, require_complete
 from ..epipolar.model import EpipolarModel
-
-Floats = NDArray[np.float64]
-
 
 BLOCK = 1024  # px, side of what is read at once
 MOST = 250_000  # pixels of a triplet, about, that are compared

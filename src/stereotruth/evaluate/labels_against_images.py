@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import binned_statistic_2d
 
 from ..core.errors import InputError
+from ..core.numerics.arrays import Floats
 from ..core.numerics.statistics import ErrorSum
 from ..core.products.files import read_table, write_table
 from ..core.products.grids import blocks, open_grid, require_complete
@@ -29,9 +30,6 @@ from ..tiles.label_surfaces import BUILDING, VEGETATION
 from ..tiles.manifest import Tile, read_manifest
 from ..tiles.sift_matches import GROSS_PX
 from ..tiles.tile_checks import warp_tile
-
-Floats = NDArray[np.float64]
-
 
 BLOCK = 1024  # px of a grid, that are read at once
 CELL_PX = 128  # of the maps of errors

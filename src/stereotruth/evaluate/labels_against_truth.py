@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.job import progress
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.statistics import LIMITS, Calibration, ErrorSum
 from ..core.products.files import write_json, write_table
 from ..core.products.grids import blocks, open_grid
@@ -28,9 +29,7 @@ from ..core.status import Status
 from ..tiles.manifest import Tile, labelled_tiles
 
 log = logging.getLogger("stereotruth")
-Bools = NDArray[np.bool_]
 Flags = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 
 BLOCK = 1024  # px

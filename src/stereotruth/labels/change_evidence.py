@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats, Singles
 from ..core.numerics.windows import box_max, summed_area
 from ..epipolar.surface_windows import (
     alike_correlation,
@@ -35,10 +36,7 @@ from ..sensor.image_noise import ROUNDING
 from .pair_window import Labels, PairWindow
 from .shifted_agreement import FAR, SHIFTS_PX, shifted_agreement
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Bits = NDArray[np.uint32]
-Bools = NDArray[np.bool_]
 
 CLOSE_PX = 5  # side of the windows that see what is a few pixels wide
 AGREED = 0.95  # correlation of these, mean of 3 x 3: with more, hardly anything has changed

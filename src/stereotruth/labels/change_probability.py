@@ -18,14 +18,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats, Singles
 from ..epipolar.surface_windows import alike_mean, surface_mean
 from ..epipolar.window_sums import SURFACE_PX, wanted_runs
 from .change_evidence import LabelledWindow, beyond_learned, change_evidence
 from .decision_trees import DecisionTrees
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 MEANS_PX = 12  # pixels up to here have a say in the probability of one
 AROUND = (2, 1), (4, 1), (8, 2), (MEANS_PX, 3)  # px up to which, one of so many, it is averaged;

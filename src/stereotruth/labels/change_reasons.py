@@ -24,15 +24,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Bytes, Floats
 from ..core.numerics.windows import box_max, window_sums
 from ..core.status import Reason
 from ..lidar.point_store import VEGETATION_CLASSES, WATER_CLASS
 from .change_evidence import WINDOW_PX, LabelledWindow
 from .shifted_agreement import WIDE_SHIFTS_PX, shifted_agreement
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
 
 UNCLASSED = (0, 1)  # ASPRS: never classified, and unclassified
 GROUND_CLASS, TREE_CLASS, BUILDING_CLASS = 2, 5, 6

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.windows import box_max, window_sums
 from ..core.status import Status, is_labelled
 from ..lidar.lattice import LATTICE_M
@@ -42,8 +43,6 @@ from ..surface.surface import RoughTops
 from .pair_window import Labels, PairWindow, WindowLabels, merged_status
 from .view_geometry import PixelScale
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Steps = NDArray[np.int32]
 
 # A pixel has no label if one up to HIGHER_REACH px off is higher by HIGHER_PX: a contour that

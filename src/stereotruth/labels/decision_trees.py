@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Singles
 
-Singles = NDArray[np.float32]
 Steps = NDArray[np.int32]
 TREE_COLUMNS = "sum tree feature limit missing_is_below above value"
 LEAF = -1  # as the feature of a node that asks none

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from ..align.alignment import ViewFit
 from ..core.errors import InputError
 from ..core.job import progress
+from ..core.numerics.arrays import Floats, Ints
 from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.windows import box_max
 from ..core.products.grids import Layer, atomic_store, blocks, create_grid
@@ -43,8 +44,6 @@ from .crowns import HIGHER_PX, HIGHER_REACH, NearestTops
 from .view_geometry import PixelScale
 
 log = logging.getLogger("stereotruth")
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 IMAGE_CHUNK, IMAGE_SHARD = 256, 1024
 NO_POINTS, MEASURED, UNDECIDED, CROWN = range(4)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.config.configuration import LabelSettings
+from ..core.numerics.arrays import Bytes, Singles
 from ..core.products.files import atomic_file
 from ..core.products.grids import Layer
 from ..core.status import Reason, Status, is_labelled, statuses_of
@@ -22,8 +23,6 @@ from .view_geometry import Pair
 
 GREATEST_COUNT = 65535  # of points of a pixel that is stored
 
-Singles = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
 Shorts = NDArray[np.uint16]
 Block = tuple[slice, slice]
 

@@ -11,16 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Bytes, Floats, Ints, Singles
 from ..core.numerics.windows import window_sums
 from ..core.status import Status
 from ..epipolar.warping import warp_rows
 from ..sensor.image_noise import NoiseCurve, detail
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
 
 USABLE, MASKED = 1, 2  # bits
 # Of what holds of a pixel, its status is the first of these.

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints, Singles
 from ..core.status import Status
 from ..lidar.lattice import PER_DEG, PER_M
 from .layers import layers, layers_of
@@ -35,11 +36,6 @@ from .pair_window import (
 from .pixel_labels import BITS, PX, noise_variance
 from .scene_inputs import SceneInputs
 from .window_points import WindowGround
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 PART_PX = 256  # side of the parts of a block whose points are in memory at once
 # A variance below this share of the mean square is what rounding leaves of a constant window.

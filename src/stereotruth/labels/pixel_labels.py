@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Bytes, Floats, Ints
 from ..core.numerics.windows import box_max
 from ..core.status import Status
 from ..epipolar.window_sums import SURFACE_PX
@@ -36,11 +36,6 @@ from ..surface.scale import FACET_RESIDUAL_PX, HEIGHT_NOISE_M, PRIOR_NOISE_M
 from .pair_window import USABLE, Labels, PairWindow, WindowLabels, merged_status
 from .view_geometry import PixelScale
 from .window_points import PointBlock
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
 
 BITS = 16
 PX = 1 << BITS  # steps per px

@@ -13,18 +13,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Floats, Singles
 from ..core.numerics.windows import box_max
 from ..epipolar.surface_windows import apart_from_steps, correlations, surface_mean, surface_means
 from ..epipolar.warping import values_in_row
 from ..epipolar.window_sums import BLOCK, Runs, wanted_runs
 from .pair_window import Detail, Labels, PairWindow
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 SHIFTS_PX = (-15.0, -12.0, -10.0, -8.0, -6.5, -5.0, -4.0, -3.0, -2.0, -1.0)
 SHIFTS_PX += (1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0)

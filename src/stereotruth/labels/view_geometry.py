@@ -22,14 +22,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..align.label_uncertainty import LabelUncertainty
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import DEGREE_M
 from ..core.status import Status
 from ..epipolar.model import EpipolarModel
 from ..lidar.lattice import LATTICE_DEG
 from ..surface.scale import GROUND_CELL_PX, SurfaceScale
 from .pair_window import Array2D, MaskedImage
-
-Floats = NDArray[np.float64]
 
 
 class ViewGeometry(Protocol):

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Bytes, Floats, Ints
 from ..core.numerics.geometry import corners_of_hull
 from ..core.numerics.windows import box_max
 from ..lidar.lattice import CELL_BITS, LATTICE_DEG, LATTICE_M
@@ -30,15 +31,11 @@ from ..surface.vertices import Vertices
 from .view_geometry import Rays, ViewGeometry
 
 Box = tuple[float, float, float, float]
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
 
 READ_POINTS = 1 << 20  # about as many are read at once
 MOST_POINTS = 2_000_000  # of a window whose surface is worked on at once
 BLOCK = 1 << 16  # points that go through the projection at once, while they are in the cache
 
-Bools = NDArray[np.bool_]
 
 SPARE_PX = 3.0  # for what is not linear in a square or between places of a block, and roundings
 # A pixel may see a surface that is extrapolated beyond its points: its position in the right image

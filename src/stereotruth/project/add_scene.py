@@ -1,4 +1,4 @@
-"""Scenes in the sheets: a row from a delivery (images, views, LiDAR), rows listed and removed."""
+"""A scene's row in the sheets, from a delivery: images, views, LiDAR."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..align.gcp_checks import fit_exchanged, misfits_of_sides
 from ..align.images import open_view
 from ..core import sheets
 from ..core.errors import InputError
-from ..core.products.files import atomic_file, files_below
+from ..core.products.files import files_below
 from ..core.products.rasters import open_raster
 from ..epipolar.fit import fit_epipolar
 from ..epipolar.model import EpipolarModel
@@ -103,7 +103,9 @@ def _in_folders(folders: Sequence[Path]) -> tuple[list[Path], list[str]]:
         raise InputError(
             f"{len(wanted)} images that may be of the pair: {there}",
             file=folders[0],
-            remedy="name the two: stereotruth scene add LEFT RIGHT --lidar …",
+            remedy="name the two: stereotruth scene add LEFT RIGHT --lidar …; list more than two "
+            "of a place in images.tsv (key images of config.yaml), and let stereotruth pairs "
+            "choose",
         )
     return wanted, lines
 
@@ -164,7 +166,8 @@ def add_scene(
     first = delivery[0].absolute()
     folder = first if first.is_dir() else first.parent
     city = city or re.sub(r"[^A-Za-z0-9-]+", "-", folder.name).strip("-") or "City"
-    name = name or _unused(city, scenes)
+    numbered = (f"{re.sub(r'[^A-Za-z0-9-]', '-', city)}-{k}" for k in range(1, 10_000))
+    name = name or next(name for name in numbered if name not in scenes)
     if name in scenes:
         raise InputError(
             f"scene {name!r} is there already", file=rows, remedy="take another --name"
@@ -228,7 +231,7 @@ def _refuse_repeated(
             raise InputError(
                 f"scene {name!r} has these two images already",
                 file=rows,
-                remedy=f"stereotruth check {name}; or stereotruth scene remove {name}, then add it",
+                remedy=f"stereotruth check {name}; or take its line out, then add it",
             )
 
 
@@ -281,12 +284,6 @@ def in_order(
     return (one, other), model, [f"left: {one.path}", f"right: {other.path}", words]
 
 
-def _unused(city: str, scenes: dict[str, sheets.Scene]) -> str:
-    """The first of City-1, City-2 … that no scene has."""
-    base = re.sub(r"[^A-Za-z0-9-]", "-", city)
-    return next(name for k in range(1, 10_000) if (name := f"{base}-{k}") not in scenes)
-
-
 def _prefix(city: str, cities: dict[str, sheets.City]) -> str:
     """Two letters or more of the city that no other has."""
     letters = re.sub(r"[^A-Za-z0-9]", "", city).upper() or "C"
@@ -301,46 +298,3 @@ def _as_options(remedy: str) -> str:
     for column in ("lidar_crs", "geoid"):
         remedy = re.sub(rf"\b{column}\b", f"--{column.replace('_', '-')}", remedy)
     return remedy
-
-
-def list_scenes(configfiles: Sequence[Path] | None = None) -> list[str]:
-    """A line for each scene of the sheet: name, city, images."""
-    settings, _ = configured(configfiles)
-    _, scenes, _ = read_rows(settings)
-    if not scenes:
-        rows = sheet(settings, "scenes")
-        return [f"{rows}: no scene. Next: stereotruth scene add DELIVERY --lidar FOLDER"]
-    width = max(map(len, scenes))
-    return [
-        f"{name:{width}}  {scene.city}: {scene.left_image}, {scene.right_image}, {scene.lidar}"
-        for name, scene in scenes.items()
-    ]
-
-
-def remove_scene(name: str, configfiles: Sequence[Path] | None = None) -> str:
-    """Take the row of a scene out of its sheet; its products stay. Raises InputError without one.
-
-    Other lines, remarks among them, stay as they are.
-    """
-    settings, _ = configured(configfiles)
-    file = Path(sheet(settings, "scenes"))
-    lines = file.read_text(encoding="utf-8-sig").splitlines(keepends=True)
-    begin = next(k for k, line in enumerate(lines) if line.strip() and not line.startswith("#"))
-    column = [cell.strip() for cell in lines[begin].split("\t")].index("scene")
-
-    def cell_of(line: str) -> str:
-        cells = line.rstrip("\r\n").split("\t")
-        return cells[column].strip() if column < len(cells) else ""
-
-    kept = [
-        line
-        for k, line in enumerate(lines)
-        if k <= begin or line.startswith("#") or cell_of(line) != name
-    ]
-    if len(kept) == len(lines):
-        raise InputError(
-            f"no scene {name!r}", file=file, remedy="stereotruth scene list names all of them"
-        )
-    with atomic_file(file) as scratch:
-        scratch.write_text("".join(kept), encoding="utf-8")
-    return f"{file}: scene {name} taken out; what was made of it stays under results/ and tiles/"

@@ -14,7 +14,7 @@ from ..lidar.frames import Epoch
 from ..tiles.scene_stores import cell_step
 from .check_scene import Looked, check_scene
 from .expected import check_resources, duration
-from .findings import Findings, Level
+from .findings import Findings
 from .project import (
     adjusted_scenes,
     check_fixed,
@@ -38,7 +38,7 @@ def chosen(
 ) -> dict[str, Scene]:
     """The scenes that names of scenes or cities stand for; all without names.
 
-    Raises InputError for a name that neither sheet has.
+    Raises InputError for a name that neither sheet has, and if there is none.
     """
     names, cities = list(names), set(cities)
     unknown = [name for name in names if name not in scenes and name not in cities]
@@ -47,11 +47,16 @@ def chosen(
         raise InputError(
             f"no scene or city {unknown[0]!r}", file=rows, remedy=f"take of these: {known}"
         )
-    return {
+    found = {
         name: scene
         for name, scene in scenes.items()
         if not names or name in names or scene.city in names
     }
+    if not found:
+        raise InputError(
+            "no scene in it", file=rows, remedy="stereotruth scene add DELIVERY --lidar FOLDER"
+        )
+    return found
 
 
 def check_project(
@@ -68,25 +73,19 @@ def check_project(
     with project.of("configuration"):
         require_scenes(configfiles)
         settings, files = configured(configfiles)
-        project.say("configuration", Level.FACT, files)
+        project.fact("configuration", files)
         tiles = settings.tiles
         cell_step(tiles.size, tiles.stride or tiles.size)
     if settings is None:
         return [project]
     with project.of("sheets"):
         cities, every_scene = read_scenes(settings)
-        rows = sheet(settings, "scenes")
         images = read_images(settings, cities)
         check_fixed(settings, every_scene, images)
-        found = chosen(names, every_scene, cities, rows)
-        if not found:
-            raise InputError(
-                "no scene in it", file=rows, remedy="stereotruth scene add DELIVERY --lidar FOLDER"
-            )
-        scenes = found
+        scenes = chosen(names, every_scene, cities, sheet(settings, "scenes"))
         towns = len({scene.city for scene in scenes.values()})
         count = f"{in_number(len(scenes), 'scene')} of {towns} {'city' if towns == 1 else 'cities'}"
-        project.say("sheets", Level.FACT, count)
+        project.fact("sheets", count)
     if scenes is None:
         return [project]
     in_sheet = {name: names_in_pair(scene, images) for name, scene in every_scene.items()}
@@ -135,7 +134,7 @@ def _check_synthetic(scene: Scene, found: Findings) -> None:
         city = city_of(scene.city)
         words = "images, LiDAR and truth are made by the run"
         if city.twin is None:
-            found.say("input", Level.FACT, f"synthetic: {words}")
+            found.fact("input", f"synthetic: {words}")
             return
         for file in city.twin.files:
             if not Path(file).is_file():
@@ -144,4 +143,4 @@ def _check_synthetic(scene: Scene, found: Findings) -> None:
                     file=file,
                     remedy=f"put it back, or correct its path in {file_of(city.name)}",
                 )
-        found.say("input", Level.FACT, f"twin of {city.twin.file}: {words}")
+        found.fact("input", f"twin of {city.twin.file}: {words}")

@@ -21,7 +21,7 @@ from ..lidar.ingest import SurveyedFile, ingest, survey
 from ..lidar.lattice import Footprint
 from ..lidar.point_store import PointStore
 from ..lidar.strip_comparison import compare_strips
-from .findings import Findings, Level
+from .findings import Findings
 
 MOST_POINTS = 6_000_000  # read and compared in seven seconds
 
@@ -44,9 +44,8 @@ def check_strips(surveyed: Sequence[SurveyedFile], scene: Scene, found: Findings
         return
     sentence = _sentence(files, scene.lidar_crs, scene.geoid)
     if sentence:
-        found.say(
+        found.doubt(
             "LiDAR",
-            Level.DOUBT,
             sentence,
             "labels have this in their uncertainty; ingest.strips: adjusted moves the points",
         )
@@ -101,21 +100,22 @@ def check_lidar(
         looked = list(pool.map(look, files))
     surveyed = [item for item in looked if isinstance(item, SurveyedFile)]
     errors = [item for item in looked if isinstance(item, InputError)]
-    for problem, (error, count) in _by_text(errors).items():
+    for problem, count in Counter(error.problem for error in errors).items():
+        error = next(error for error in errors if error.problem == problem)
         name = error.file or "LiDAR"
         more = f" (and {count - 1} more files)" if count > 1 else ""
-        found.say("LiDAR", Level.ERROR, f"{name}{more}: {problem}", error.remedy)
+        found.fault("LiDAR", f"{name}{more}: {problem}", error.remedy)
     notes = Counter(note for file in surveyed for note in file.notes)
     for note, count in notes.items():
         of = "" if count == len(files) == 1 else f"{count} of {len(files)} files: "
         remedy = _geoids(surveyed) if NO_DATUM[0] in note else ""
-        found.say("LiDAR", Level.DOUBT, f"{of}{note}", remedy)
+        found.doubt("LiDAR", f"{of}{note}", remedy)
     surfaces = Counter(file.surface for file in surveyed)
     systems = Counter(file.system for file in surveyed)
     for what, kinds in (("heights", surfaces), ("systems", systems)):
         if len(kinds) > 1:
             said = "; ".join(f"{count}: {kind}" for kind, count in kinds.items())
-            found.say("LiDAR", Level.DOUBT, f"files differ in their {what} ({said})")
+            found.doubt("LiDAR", f"files differ in their {what} ({said})")
     if surveyed:
         points = sum(file.points for file in surveyed)
         placed = [file.heights for file in surveyed if file.heights]
@@ -124,9 +124,8 @@ def check_lidar(
             dense = f", at least {points / area:.2g} points/m² (over the boxes of their headers)"
         if placed:
             reach = f", {min(h[0] for h in placed):.0f} to {max(h[1] for h in placed):.0f} m"
-        found.say(
+        found.fact(
             "LiDAR",
-            Level.FACT,
             f"{points / 1e6:.1f} M points in {len(surveyed)} "
             f"file{'s' * (len(surveyed) > 1)}{dense}, {next(iter(systems))}; heights "
             f"{next(iter(surfaces))}{reach}",
@@ -148,18 +147,8 @@ def _say_what_is_read(surveyed: Sequence[SurveyedFile], found: Findings) -> None
     touched = sum(file.read[0] > 0 for file in surveyed)
     points, size = (sum(file.read[k] for file in surveyed) for k in (0, 1))
     every = sum(file.points for file in surveyed), sum(file.bytes for file in surveyed)
-    found.say(
+    found.fact(
         "LiDAR",
-        Level.FACT,
         f"a run reads {touched} of {in_number(len(surveyed), 'file')}, {points / 1e6:.1f} of "
         f"{every[0] / 1e6:.1f} M points, {size / 1e6:.1f} of {every[1] / 1e6:.1f} MB",
     )
-
-
-def _by_text(errors: Sequence[InputError]) -> dict[str, tuple[InputError, int]]:
-    """First error and number of errors of each problem."""
-    counts = Counter(error.problem for error in errors)
-    return {
-        problem: (next(e for e in errors if e.problem == problem), count)
-        for problem, count in counts.items()
-    }

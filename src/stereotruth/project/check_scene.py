@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rasterio
 from rasterio.errors import RasterioError
 
 from ..align.align import align, from_rpcs
@@ -107,9 +106,8 @@ def _check_images(scene: Scene, settings: Configuration, looked: Looked, found: 
             good = False
             said = any(f.text.startswith(str(image)) for f in found[before:])
             if not said and not any(f"{view}_image" in f.text for f in found):
-                found.say(
+                found.fault(
                     "files",
-                    Level.ERROR,
                     f"{image}: {view}_image does not exist",
                     "correct the path (relative to the working directory, or absolute)",
                 )
@@ -138,7 +136,9 @@ def _check_pixels(image: Path, bands: Mapping[str, Any]) -> None:
     """Raise InputError as rule rectify does; what would take long to read is left to it."""
     try:
         with open_raster(image) as dataset:
-            pixels, sampled = dataset.width * dataset.height, _is_sampled(dataset)
+            pixels, dtype = dataset.width * dataset.height, (*dataset.dtypes, "")[0]
+        # to scale values of these types, a source reads all over the image when it is opened
+        sampled = dtype.startswith(("float", "int32", "uint32", "int64", "uint64"))
     except RasterioError:
         pixels, sampled = 0, False  # a source says what is wrong
     small = image.stat().st_size <= WHOLE_BYTES and pixels <= WHOLE_PIXELS
@@ -174,12 +174,6 @@ def _refuse_empty(source: Source, *, whole: bool) -> None:
     )
 
 
-def _is_sampled(dataset: rasterio.DatasetReader) -> bool:
-    """Whether opening an image as a source reads all over it, to scale its values."""
-    dtype = dataset.dtypes[0] if dataset.count else ""
-    return dtype.startswith("float") or dtype in ("int32", "uint32", "int64", "uint64")
-
-
 @contextmanager
 def _or_of_others(alone: bool, found: Findings) -> Iterator[None]:
     """Too few control points are a fact where images are adjusted with those of other scenes."""
@@ -188,7 +182,7 @@ def _or_of_others(alone: bool, found: Findings) -> Iterator[None]:
     except TooFewPoints as error:
         if alone:
             raise
-        found.say("GCPs", Level.FACT, f"{error.problem}: placed by other images and tie points")
+        found.fact("GCPs", f"{error.problem}: placed by other images and tie points")
 
 
 def _check_alignment(
@@ -224,7 +218,7 @@ def _check_alignment(
             used = [sum(gcp.used for gcp in fit.gcps) for fit in alignment.fits]
             sigma = max(fit.rms("after") for fit in alignment.fits)
             text = f"{used[0]} and {used[1]} of {len(gcps.ids)} used, {sigma:.2f} px rms at most"
-            found.say("GCPs", Level.FACT, text)
+            found.fact("GCPs", text)
         elif images and not scene.gcps:
             alignment = from_rpcs(*pair, model=model, scene=name, provenance={})
     if alignment is None and images:  # to hold the LiDAR against the images all the same
@@ -246,16 +240,14 @@ def _check_pair(alignment: Alignment, scene: Scene, found: Findings) -> Epipolar
     rows, cols = model.shape
     report = model.report
     pixel = np.sqrt(pixel_m2(model))
-    found.say(
+    found.fact(
         "images",
-        Level.FACT,
         f"{cols} x {rows} px of {pixel:.2f} m in common, convergence "
         f"{report['convergence_angle_deg']:.1f} degrees, {report['view_order']}",
     )
     if report["view_order"] == "left looks forward":
-        found.say(
+        found.doubt(
             "images",
-            Level.DOUBT,
             "the left image is the forward view; in the paper's data it is the backward one",
             "exchange left_image and right_image if disparities should be as the paper's",
         )
@@ -283,13 +275,12 @@ def _hold_against_gcps(
             off.append(height - high)
     if here and 2 * len(off) > here:
         shift = float(np.median(off))
-        found.say(
+        found.doubt(
             "heights",
-            Level.DOUBT,
             f"{len(off)} of {here} GCPs lie {'below' if shift < 0 else 'above'} every LiDAR point "
             f"of their files, by {abs(shift):.1f} m in the middle",
-            "check the LiDAR's vertical datum and unit (geoid, feet), and that the GCPs' heights "
-            "are ellipsoidal metres",
+            "check the LiDAR's vertical datum and unit (a geoid that is missing, or of the other "
+            "sign: its heights are added; feet), and that the GCPs' heights are ellipsoidal metres",
         )
 
 
@@ -339,9 +330,8 @@ def _hold_against_images(
         margin = (high - low) / 4
         middle = np.median([np.mean(file.heights) for file in placed])
         if not low - margin <= middle <= high + margin:
-            found.say(
+            found.doubt(
                 "heights",
-                Level.DOUBT,
                 f"the LiDAR, about {middle:.0f} m, is outside the {low:.0f} to {high:.0f} m of the "
                 "RPC",
                 "check that its heights are ellipsoidal metres",

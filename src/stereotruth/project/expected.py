@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..core.config.configuration import Configuration
 from ..core.errors import in_number
+from ..core.numerics.arrays import Bools
 from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.windows import summed_area, window_sums
 from ..epipolar.model import EpipolarModel
@@ -34,14 +35,13 @@ LABELLED = {
 POINT_S, PX_S, COVERED_PX_S, SCENE_S, JOB_S = 9.6e-7, 1.2e-6, 9.8e-6, 60.0, 8.0
 JOBS = 5  # of a scene, beside one for each LiDAR file
 POINT_BYTES, PX_BYTES = 12.0, 24.0  # on the disk
-SPARE = 1.2  # of the disk: logs, records, blocks in the making
+SPARE = 1.2  # of the disk: blocks in the making
+RECORDS_BYTES = 2e8  # logs, pages, what Snakemake notes
 MEMORY = 4.0e9  # that rules of the way to tiles ask for
 SUPPORT_PX = 2.0  # around a place, of an image that is resampled by cubic convolution
 NODES = 128  # along the longer side of the grid
 SMALL_HOLE_M2, SMALL_HOLE = 10_000, 0.001  # rims that are not worth a line: area, and share
 BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -162,9 +162,8 @@ def check_labels(
     per_m2 = float(density[covered].mean())
     per_px, recipe = per_m2 * pixel_m2(nodes.model), settings.project.recipe
     expected = expected_share(per_px, recipe)
-    found.say(
+    found.fact(
         "labels",
-        Level.FACT,
         f"{per_m2:.2g} points/m² by the headers, {per_px:.2g} a pixel, on {100 * share:.0f} % of "
         f"what both images show: some {100 * expected:.0f} % of the pixels that neither image "
         f"hides will have a label (project.recipe: {recipe}), "
@@ -186,10 +185,9 @@ def _say_holes(
     _, group, sizes, _ = cv2.connectedComponentsWithStats(empty.astype(np.uint8), connectivity=4)
     largest = group == 1 + int(np.argmax(sizes[1:, cv2.CC_STAT_AREA]))
     lon, lat = (float(values[largest].mean()) for values in ground)
-    found.say(
+    found.fact(
         "LiDAR",
-        Level.FACT,
-        f"{area / 1e6:.3f} km² of what both images show lie in no file's bounds and get no label, "
+        f"{_area(area)} of what both images show lie in no file's bounds and get no label, "
         f"most of it around longitude {lon:.5f}, latitude {lat:.5f}",
     )
 
@@ -269,33 +267,34 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
     covered = sum(fact.pixels * fact.covered for fact in facts)
     seconds = POINT_S * points + PX_S * pixels + COVERED_PX_S * covered + SCENE_S * len(facts)
     seconds += JOB_S * sum(JOBS + fact.lidar_files for fact in facts)
-    needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels)
+    needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels) + RECORDS_BYTES
     free = shutil.disk_usage(Path.cwd()).free
-    found.say(
+    found.fact(
         "time",
-        Level.FACT,
         f"about {duration(seconds / max(cores or 1, 1))} on the {cores} cores of this machine, "
         "from nothing to tiles",
     )
     if needed > free:
-        found.say(
+        found.fault(
             "disk",
-            Level.ERROR,
             f"{_gb(needed)} are needed in {Path.cwd()}, {_gb(free)} are free",
             "make space, or work in a folder on a larger disk",
         )
     else:
-        found.say("disk", Level.FACT, f"{_gb(needed)} of the {_gb(free)} that are free")
+        found.fact("disk", f"{_gb(needed)} of the {_gb(free)} that are free")
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if memory < MEMORY:
-        found.say(
+        found.doubt(
             "memory",
-            Level.DOUBT,
             f"{_gb(memory)} in all, jobs ask for up to {_gb(MEMORY)}",
             "run with --cores 1",
         )
     else:
-        found.say("memory", Level.FACT, f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
+        found.fact("memory", f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
+
+
+def _area(m2: float) -> str:
+    return f"{m2 / 1e6:.3f} km²" if m2 >= SMALL_HOLE_M2 else f"{m2:.0f} m²"
 
 
 def _gb(count: float) -> str:

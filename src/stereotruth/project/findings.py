@@ -38,6 +38,20 @@ class Finding:
     remedy: str = ""
 
 
+@contextmanager
+def heard(name: str, level: int = logging.NOTSET) -> Iterator[list[logging.LogRecord]]:
+    """What a logger is told in the block, from a level on."""
+    records: list[logging.LogRecord] = []
+    listener = logging.Handler(level)
+    listener.emit = records.append
+    logger = logging.getLogger(name)
+    logger.addHandler(listener)
+    try:
+        yield records
+    finally:
+        logger.removeHandler(listener)
+
+
 class Findings(list[Finding]):
     """What is found of one scene; InputErrors and warnings of the stages become findings."""
 
@@ -50,11 +64,22 @@ class Findings(list[Finding]):
         if not any((f.about, f.level, f.text) == (about, level, text) for f in self):
             self.append(Finding(self.scene, about, level, text, remedy))
 
+    def fact(self, about: str, text: str) -> None:
+        """Add what is so."""
+        self.say(about, Level.FACT, text)
+
+    def doubt(self, about: str, text: str, remedy: str = "") -> None:
+        """Add what a run goes through with, and may not be what is wanted."""
+        self.say(about, Level.DOUBT, text, remedy)
+
+    def fault(self, about: str, text: str, remedy: str = "") -> None:
+        """Add what a run would fail of."""
+        self.say(about, Level.ERROR, text, remedy)
+
     def error(self, about: str, error: InputError) -> None:
         """Add what a stage refuses; of a sheet all that is wrong in it."""
         for each in error.each if isinstance(error, SheetError) else (error,):
-            where = f"{each.file}: " if each.file else ""
-            self.say(about, Level.ERROR, f"{where}{each.problem}", each.remedy)
+            self.fault(about, f"{each.file}: " * bool(each.file) + each.problem, each.remedy)
 
     @contextmanager
     def of(self, about: str) -> Iterator[None]:
@@ -62,36 +87,22 @@ class Findings(list[Finding]):
 
         So is what the operating system refuses.
         """
-        heard: list[str] = []
-        handler = _Listener(heard)
-        log = logging.getLogger("stereotruth")
-        log.addHandler(handler)
-        try:
-            yield
-        except InputError as error:
-            self.error(about, error)
-        except OSError as error:  # no permission, or gone in this moment
-            if (told := told_by_system(error)) is None:
-                raise
-            self.error(about, told)
-        finally:
-            log.removeHandler(handler)
-        for text in heard:
-            self.say(about, Level.DOUBT, text.removeprefix("warning: "))
+        with heard("stereotruth", logging.WARNING) as records:
+            try:
+                yield
+            except InputError as error:
+                self.error(about, error)
+            except OSError as error:  # no permission, or gone in this moment
+                if (told := told_by_system(error)) is None:
+                    raise
+                self.error(about, told)
+        for record in records:
+            self.doubt(about, record.getMessage().removeprefix("warning: "))
 
     @property
     def failed(self) -> bool:
         """Whether a run would fail."""
         return any(finding.level is Level.ERROR for finding in self)
-
-
-class _Listener(logging.Handler):
-    def __init__(self, heard: list[str]) -> None:
-        super().__init__(logging.WARNING)
-        self.heard = heard
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.heard.append(record.getMessage())
 
 
 STYLES = {Level.FACT: "green", Level.DOUBT: "yellow", Level.ERROR: "bold red"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -28,7 +29,7 @@ app.add_typer(errata_app, name="errata")
         "stereotruth score-dsm dsm.tif --geoid egm08_25.gtx --lidar 'tiles/*.laz' --to verdict",
     ),
 )
-def score_surface_model(
+def score_dsm(
     model: Annotated[Path, typer.Argument(help="GeoTIFF of heights, north-up, in metres.")],
     to: Annotated[Path, typer.Option(help="Folder to be written: scores.json, index.html.")],
     lidar: Annotated[
@@ -47,24 +48,41 @@ def score_surface_model(
     ] = None,
     epoch: Annotated[str, typer.Option(help="Of the model's images, 2016.4 or a date.")] = "",
 ) -> None:
-    """Judge any surface model: where it lies, its heights by surface and slope, edges of roofs."""
+    """Judge any surface model: where it lies, its heights by surface and slope, edges of roofs.
+
+    National frames are brought to ITRF2020 at the epoch.
+    """
     from ..core.products.files import refuse_others
-    from .score_dsm import score_dsm
+    from ..core.sheets import lidar_files, store_names
+    from ..core.tables import epoch_year
+    from ..evaluate.surface_models.reference import LidarReference, RasterReference
+    from ..evaluate.surface_models.score import describe, score_surface_model, write_verdict
+    from ..lidar.frames import DEFAULT_EPOCH, Epoch, Epochs
+    from ..lidar.ingest import ingest
 
     refuse_others(to, "scores.json")
-    typer.echo(
-        score_dsm(
-            model,
-            to,
-            lidar=lidar,
-            reference=reference,
-            geoid=geoid,
-            lidar_crs=lidar_crs,
-            reference_geoid=reference_geoid,
-            reference_classes=reference_classes,
-            epoch=epoch,
+    if bool(lidar) == (reference is not None):
+        raise InputError(
+            "a surface model needs one reference", file=model, remedy="give --lidar or --reference"
         )
-    )
+    try:
+        year = epoch_year(epoch)
+    except ValueError as error:
+        raise InputError(f"--epoch {epoch!r} {error}", file=model, remedy="as 2016.4") from None
+    epochs = Epochs(DEFAULT_EPOCH if year is None else Epoch(year, "--epoch"))
+    with TemporaryDirectory(prefix="stereotruth-") as scratch:
+        if reference is not None:
+            against = RasterReference(reference, reference_geoid, reference_classes, epochs=epochs)
+        else:
+            stores = []
+            for name, file in store_names(lidar_files(lidar)).items():
+                stores.append(Path(scratch) / f"{name}.points")
+                how = {"lidar_crs": lidar_crs, "geoid": reference_geoid, "epochs": epochs}
+                ingest(file, stores[-1], **how)
+            against = LidarReference(stores)
+        verdict = score_surface_model(model, against, geoid=geoid, epochs=epochs)
+        figures = write_verdict(verdict, to, model.name)
+    typer.echo(f"{model.name}: {describe(figures)}; look at {to / 'index.html'}")
 
 
 @app.command(

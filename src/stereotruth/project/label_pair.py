@@ -45,7 +45,8 @@ def label_pair(
     the images; ``columns``: others of the scenes sheet, as ``lidar_crs`` or ``geoid``. All stages
     are those of a run; they write to ``folder``, a project whose ``config.yaml`` holds, and the
     same call there carries on where a run has ended. Without a folder all is made in a temporary
-    one, and the dataset is in memory. ``cores``: all without it.
+    one, and the dataset is in memory. ``cores``: all without it. Lines of the run are shown as
+    they come.
 
     Of each pixel [y, x]: ``disparity`` (px), ``height`` (m), ``status``, ``uncertainty`` (px) and
     the other layers of ``results/project``, and the grey values ``left``; ``right`` [y, x_right].
@@ -81,11 +82,18 @@ def _from_anywhere(path: str | Path) -> str:
 
 def _run(folder: Path, target: str, cores: int | None) -> None:
     words = [sys.executable, "-m", f"{__package__}.main", "run", target, "--cores"]
-    done = subprocess.run(
-        [*words, str(cores or "all")], cwd=folder, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        lines = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+    lines = []
+    with subprocess.Popen(
+        [*words, str(cores or "all")],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as run:
+        for line in filter(str.strip, run.stdout or ()):
+            print(line, end="", file=sys.stderr, flush=True)
+            lines.append(line.rstrip())
+    if run.returncode:
         told = dict.fromkeys(line for line in lines if "error:" in line) or lines[-SAID:]
         raise InputError(
             "\n".join(["the run ended without labels:", *told]),

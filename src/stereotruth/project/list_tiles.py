@@ -45,8 +45,6 @@ def list_of_scenes(
     cities, scenes, _ = read_rows(settings)
     rows = sheet(settings, "scenes")
     found = chosen(names, scenes, cities, rows)
-    if not found:
-        raise InputError("no scene in it", file=rows, remedy="add one, whose ground is then known")
     if not to.lower().endswith(SUFFIX):
         raise InputError(
             "is no name of a list of tiles", file=to or "--to", remedy="end it with .tsv"

@@ -208,25 +208,6 @@ def scene_add(
     )
 
 
-@scene_app.command("list", epilog=examples("stereotruth scene list"))
-def scene_list(configfile: Configured = None) -> None:
-    """The scenes of the project: city, images and LiDAR of each."""
-    from .add_scene import list_scenes
-
-    _print(list_scenes(configfile))
-
-
-@scene_app.command("remove", epilog=examples("stereotruth scene remove Marseille-1"))
-def scene_remove(
-    scene: Annotated[str, typer.Argument(help="Name of the scene.")],
-    configfile: Configured = None,
-) -> None:
-    """Take a scene's row out of the scenes sheet; what was made of it stays."""
-    from .add_scene import remove_scene
-
-    typer.echo(remove_scene(scene, configfile))
-
-
 @gcps_app.command(
     "import",
     epilog=examples(

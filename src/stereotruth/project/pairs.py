@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
@@ -79,7 +80,9 @@ class Choice:
         """
         allowed = [rated for rated in pairs if self.allows(rated.pair)]
         most = len(allowed) if self.most is None else self.most
-        selection = _linking(allowed, self.each)
+        selection = _Selection(allowed, self.each)
+        while selection.choose(lambda names: new_links([names], selection.chosen)):
+            pass
         if len(selection.chosen) > most:
             selection = _growing(allowed, self.each, most)
         while len(selection.chosen) < most and selection.choose():
@@ -102,7 +105,12 @@ class _Selection:
 
     def choose(self, wanted: Callable[[Names], object] = lambda _: True) -> bool:
         """Choose the best of those ``wanted``, by names; false if there is none."""
-        free = [names for names in self.remaining if self._may(names) and wanted(names)]
+        most = math.inf if self.each is None else self.each
+        free = [
+            names
+            for names in self.remaining
+            if max(self.used[name] for name in names) < most and wanted(names)
+        ]
         if not free:
             return False
         best = max(
@@ -115,17 +123,6 @@ class _Selection:
         self.used.update(best)
         self.chosen.append(best)
         return True
-
-    def _may(self, names: Names) -> bool:
-        return self.each is None or max(self.used[name] for name in names) < self.each
-
-
-def _linking(pairs: Sequence[RatedPair], each: int | None) -> _Selection:
-    """The best pairs that link all images which any of the ``pairs`` has."""
-    selection = _Selection(pairs, each)
-    while selection.choose(lambda names: new_links([names], selection.chosen)):
-        pass
-    return selection
 
 
 def _growing(pairs: Sequence[RatedPair], each: int | None, most: int) -> _Selection:
@@ -142,14 +139,6 @@ def _growing(pairs: Sequence[RatedPair], each: int | None, most: int) -> _Select
     while len(selection.chosen) < most and (selection.choose(links) or selection.choose(apart)):
         pass
     return selection
-
-
-def roughness_of(city: str, settings: Configuration) -> float | None:
-    """Roughness of a city by the points that its scenes have ingested, m; None without any."""
-    _, scenes, _ = read_rows(settings)
-    folders = [INGESTED / city / name for name, scene in scenes.items() if scene.city == city]
-    stores = [PointStore(path) for folder in folders for path in sorted(folder.glob("*.points"))]
-    return roughness_m(stores) if stores else None
 
 
 def rated_pairs(
@@ -205,7 +194,9 @@ def write_pairs(
         sheets.check(cells | here, sheets.Scene, f"scene {name}")
         append_row(rows, cells | here)
         written += 1
-    return f"{rows}: {written} of {len(rated)} pairs written. Next: stereotruth check {city}"
+    how = ", to link the images and to differ in convergence" if choice.most else ""
+    said = f"{rows}: {written} of {len(rated)} pairs written{how}"
+    return f"{said}. Next: stereotruth check {city}"
 
 
 def _free_name(pair: SitePair, scenes: dict[str, sheets.Scene]) -> str:
@@ -265,7 +256,9 @@ def list_pairs(
 ) -> Listing:
     """All pairs of a site. ``choice`` is written to the scenes sheet; None: nothing is."""
     settings, _ = configured(configfiles)
-    roughness = roughness_of(city, settings)
+    of_city = (name for name, scene in read_rows(settings)[1].items() if scene.city == city)
+    files = [file for name in of_city for file in sorted((INGESTED / city / name).glob("*.points"))]
+    roughness = roughness_m([PointStore(file) for file in files]) if files else None
     rated = rated_pairs(city, settings, roughness)
     lines = [_in_words(city, roughness)]
     if choice is not None:

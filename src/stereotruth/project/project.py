@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -12,15 +11,13 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from stereocities.cities import FOLDER as SYNTHETIC_FOLDER
 from stereocities.cities import city_of, lidar_files, synthetic_city
 
 from ..core import sheets
 from ..core.config.configuration import Configuration
-from ..core.config.section import merged
-from ..core.errors import InputError, in_words, told_by_system
+from ..core.config.section import merged, read_mapping
+from ..core.errors import InputError, in_words
 from ..core.products.remote_files import (
     FOLDER,
     bring_files,
@@ -50,8 +47,6 @@ _PACKAGE = Path(__file__).parents[1]
 FILES = _PACKAGE / "shipped" if (_PACKAGE / "shipped").is_dir() else _PACKAGE.parents[1]
 CONFIG = "config.yaml"  # of a user's own project
 SHARED = Path("config") / CONFIG  # of a clone: the Snakefile reads it
-MOST_BYTES = 1_000_000  # of a configuration
-MOST_VALUES = 200_000
 
 LOOKED_AT = 10  # scenes of a city whose deliveries are looked into
 ANYWHERE = (0.0, 0.0)  # degrees: a day does not depend on the place
@@ -104,77 +99,6 @@ def require_scenes(files: Sequence[str | Path] | None = None) -> None:
             file=", ".join(map(str, files or [CONFIG])),
             remedy="write scenes: scenes.tsv and cities: cities.tsv into it; or the built-in "
             "cities: --example",
-        )
-
-
-def read_mapping(file: Path) -> dict[str, Any]:
-    """The keys and values of a YAML file. Raises InputError, naming it, if it has none.
-
-    Refused are also keys that stand twice, and what grows beyond all measure when its aliases are
-    put in.
-    """
-    try:
-        if file.stat().st_size > MOST_BYTES:
-            raise InputError(
-                f"{file.stat().st_size / 1e6:.1f} MB are no configuration",
-                file=file,
-                remedy="name the file of the configuration",
-            )
-        loader = yaml.SafeLoader(file.read_text(encoding="utf-8-sig"))
-        node = loader.get_single_node()
-        _refuse_repeated_and_multiplied(node, file)
-        found = None if node is None else loader.construct_document(node)
-    except FileNotFoundError:
-        raise InputError("no such file", file=file, remedy="correct its path") from None
-    except (UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
-        kinds = {UnicodeDecodeError: "is no UTF-8", RecursionError: "is nested too deeply"}
-        raise InputError(
-            f"{kinds.get(type(error), 'cannot be read as YAML')} ({' '.join(str(error).split())})",
-            file=file,
-            remedy="correct what it names, and save it as UTF-8",
-        ) from None
-    except OSError as error:
-        raise told_by_system(error) or InputError(
-            f"cannot be read: {error.strerror}", file=file, remedy="see what lies there"
-        ) from None
-    if found is not None and not isinstance(found, dict):
-        raise InputError(
-            "is no mapping of keys to values", file=file, remedy="write it as key: value"
-        )
-    return found or {}
-
-
-def _refuse_repeated_and_multiplied(top: yaml.Node | None, file: Path) -> None:
-    """Raise InputError if a key stands twice in one mapping, of which YAML would take the last, or
-    if a document has more than MOST_VALUES with all aliases put in."""
-    counts: dict[int, float] = {}
-
-    def count(node: yaml.Node) -> float:
-        if id(node) in counts:
-            return counts[id(node)]
-        counts[id(node)] = math.inf  # of an alias to what it stands in
-        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
-        if isinstance(node, yaml.MappingNode):
-            lines: dict[str, int] = {}
-            for key, _ in parts:
-                name = key.value if isinstance(key, yaml.ScalarNode) else "<<"
-                line = key.start_mark.line + 1
-                if name in lines and name != "<<":
-                    raise InputError(
-                        f"{name!r} stands twice, in lines {lines[name]} and {line}",
-                        file=file,
-                        remedy="put what both have under one of them",
-                    )
-                lines[name] = line
-            parts = [part for pair in parts for part in pair]
-        counts[id(node)] = 1 + sum(map(count, parts))
-        return counts[id(node)]
-
-    if top is not None and count(top) > MOST_VALUES:
-        raise InputError(
-            f"more than {MOST_VALUES} values, with its aliases (*) put in",
-            file=file,
-            remedy="write out what the aliases stand for",
         )
 
 

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from ..core.config.methods import DATASETS
+from ..core.config.section import read_mapping
 from ..core.errors import InputError, did_you_mean
 from .project import (
     CONFIG,
     FILES,
     configured,
     names_scenes,
-    read_mapping,
     read_scenes,
     require_project,
     require_scenes,

@@ -77,16 +77,9 @@ def make_example(folder: Path) -> str:
     for view in ("left", "right"):
         simulate_image(DEMO, scene, view, data / f"{view}.tif", seed=SEED)
     _make_lidar(DEMO, data / "lidar")
-    inside = data.relative_to(folder)
-    row = {
-        "scene": scene.name,
-        "city": DEMO.name,
-        "left_image": f"{inside}/left.tif",
-        "right_image": f"{inside}/right.tif",
-        "lidar": f"{inside}/lidar",
-        "gcps": f"gcps/{scene.name}.csv",
-    }
-    append_row(folder / "scenes.tsv", row)
+    _append_scene(
+        folder, scene.name, DEMO.name, data.relative_to(folder), points.relative_to(folder)
+    )
     append_row(folder / "cities.tsv", city_row(DEMO.name, "DM"))
     append_settings(folder, TILES)
     return "stereotruth check"
@@ -141,6 +134,13 @@ def _make_lidar(city: CitySpec, folder: Path) -> None:
         simulate_lidar_tile(city, scene, file, folder / file, spacing_m=SPACING_M, seed=SEED)
 
 
+def _append_scene(folder: Path, scene: str, city: str, data: Path, gcps: Path) -> None:
+    """The row of a scene whose images and LiDAR lie in ``data``; paths from ``folder`` on."""
+    images = {f"{view}_image": data / f"{view}.tif" for view in ("left", "right")}
+    row = {"scene": scene, "city": city, **images, "lidar": data / "lidar", "gcps": gcps}
+    append_row(folder / "scenes.tsv", row)
+
+
 def append_settings(folder: Path, lines: Sequence[str]) -> None:
     """More lines at the end of a new project's configuration."""
     with (folder / "config.yaml").open("a", encoding="utf-8") as stream:
@@ -193,15 +193,7 @@ def with_twin(folder: str | Path, file: Path, options: Options) -> str:
     folder = Path(folder)
     write_city(city, folder / file_of(NAME))
     data = file_of(NAME).parent / scene.name
-    row = {
-        "scene": scene.name,
-        "city": NAME,
-        "left_image": data / "left.tif",
-        "right_image": data / "right.tif",
-        "lidar": data / "lidar",
-        "gcps": data / "gcps.csv",
-    }
-    append_row(folder / "scenes.tsv", row)
+    _append_scene(folder, scene.name, NAME, data, data / "gcps.csv")
     append_row(folder / "cities.tsv", city_row(NAME, PREFIX))
     side = next(n for n in (1024, 512, 256, 128) if n <= shorter * 0.6 or n == 128)
     append_settings(

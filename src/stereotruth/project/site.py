@@ -16,7 +16,7 @@ from ..core.products.remote_files import bring_image, is_remote
 from ..core.sheets import Image, Scene
 from ..sensor.deliveries import Acquisition, between_suns, near
 from ..sensor.site_pairs import Links, Names, SiteImage, pair_of
-from .findings import Findings, Level
+from .findings import Findings
 from .project import names_in_pair, sheet
 
 SUNS_APART_DEG = 5.0
@@ -89,7 +89,7 @@ def check_images(
     if opened:
         dated = sum(one.image.time is not None for one in opened)
         text = f"{len(opened)} of {settings.images}, {dated} with a date"
-        found.say("images", Level.FACT, text)
+        found.fact("images", text)
     return found
 
 
@@ -110,25 +110,22 @@ def _check_date(one: OpenedImage, settings: Configuration, found: Findings) -> N
     row, image, said = one.row, one.image, one.said
     where = f"{settings.images}: image {row.image!r}"
     if image.time is None:
-        found.say(
+        found.doubt(
             "images",
-            Level.DOUBT,
             f"{where}: nothing says when it was taken, so that its pairs have no days and no sun",
             "write it into column acquired, 2020-10-25T03:12:45Z",
         )
     elif row.acquired and said.time is not None and not near(said.time, image.time):
-        found.say(
+        found.doubt(
             "images",
-            Level.DOUBT,
             f"{where}: acquired is {row.acquired}, and {said.source} says "
             f"{said.time:%Y-%m-%dT%H:%M:%SZ}",
             "correct it, or leave the cell empty",
         )
     told = row.sun_azimuth is not None and said.sun is not None and image.sun is not None
     if told and between_suns(said.sun, image.sun) > SUNS_APART_DEG:
-        found.say(
+        found.doubt(
             "images",
-            Level.DOUBT,
             f"{where}: the sun is at {image.sun[0]:.0f}, {image.sun[1]:.0f} degrees (azimuth, "
             f"elevation), and {said.source} says {said.sun[0]:.0f}, {said.sun[1]:.0f}",
             "correct it, or leave both cells empty",
@@ -150,9 +147,8 @@ def _check_ground(
             shares[one.row.image] = shares[other.row.image] = True
     for name, shared in shares.items():
         if not shared:
-            found.say(
+            found.fault(
                 "images",
-                Level.ERROR,
                 f"{settings.images}: image {name!r} shares no ground with any other image of "
                 f"{city}",
                 "correct its city or its file, or remove the row",
@@ -177,10 +173,10 @@ def check_links(
     of_city = [name for name, image in images.items() if image.city == city]
     links = Links.of(of_city, pairs)
     if links.unused:  # by choice, as of pairs --most
-        found.say("pairs", Level.FACT, f"{city}: {links.of_unused}")
+        found.fact("pairs", f"{city}: {links.of_unused}")
     if len(links.groups) > 1:
         remedy = f"stereotruth pairs {city} names what links them"
-        found.say("pairs", Level.DOUBT, f"{city}: {links.of_groups}", remedy)
+        found.doubt("pairs", f"{city}: {links.of_groups}", remedy)
 
 
 def _refuse_copies(opened: list[OpenedImage], settings: Configuration) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
-import logging
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,7 +23,8 @@ from ..core.products.files import read_json
 from ..evaluate.report.index_page import PAGES
 from ..tiles.label_moves import moves, sample_labels, worst_point
 from ..tiles.manifest import read_manifest
-from .findings import plain_table, wide
+from .check import chosen
+from .findings import heard, plain_table, wide
 from .project import configured, read_scenes, require_scenes, sheet
 from .run_workflow import arguments_for
 
@@ -59,20 +59,6 @@ class PlannedJob:
         return [part for part in parts if part and not part.startswith(FOLLOWS)]
 
 
-@contextlib.contextmanager
-def _heard(name: str, kept: list[logging.LogRecord]) -> Iterator[None]:
-    class Listener(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            kept.append(record)
-
-    logger, listener = logging.getLogger(name), Listener()
-    logger.addHandler(listener)
-    try:
-        yield
-    finally:
-        logger.removeHandler(listener)
-
-
 def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> list[PlannedJob]:
     """The jobs that a run of the targets would do. Raises InputError if there is no plan."""
     from snakemake.cli import main
@@ -80,10 +66,9 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
     given = [*targets, "--dry-run", "--cores", "1"]
     if configfiles:
         given += ["--configfile", *map(str, configfiles)]
-    said, records = io.StringIO(), []
-    status: object = 0
+    said, status = io.StringIO(), 0
     with (
-        _heard("snakemake", records),
+        heard("snakemake") as records,
         contextlib.redirect_stdout(said),
         contextlib.redirect_stderr(said),
     ):
@@ -124,10 +109,15 @@ class CityStatus:
         return "out of date" if self.made else "not made"
 
     def why(self) -> list[str]:
-        """What a run would do, and the causes of it, the most frequent first."""
-        if not self.jobs:
-            return []
+        """What a run would do, and the causes of it, the most frequent first.
+
+        Figures and pages that were never made of tiles that are up to date are nothing to do.
+        """
         jobs = sorted(self.jobs, key=lambda job: job.rule in AFTER_TILES)
+        if self.state == "up to date":
+            jobs = [job for job in jobs if MISSING not in job.reason]
+        if not jobs:
+            return []
         rules = Counter(job.rule for job in jobs)
         lines = [", ".join(f"{rule} {count}" for rule, count in rules.items())]
         causes: dict[str, list[str]] = {}
@@ -188,24 +178,15 @@ def _made(city: str) -> str:
 
 
 def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list[CityStatus]:
-    """The status of cities, all of the sheet if none is named. Raises InputError for others."""
+    """The status of cities, or of those of scenes; all of the sheet if none is named.
+
+    Raises InputError for a name that no sheet has.
+    """
     require_scenes(configfiles)
     settings, _ = configured(configfiles)
     known, scenes = read_scenes(settings)
-    with_scenes = [city for city in known if any(s.city == city for s in scenes.values())]
-    if unknown := [city for city in cities if city not in known]:
-        raise InputError(
-            f"no city {unknown[0]!r}",
-            file=sheet(settings, "cities"),
-            remedy=f"take one of {', '.join(known)}",
-        )
-    wanted = list(cities) or with_scenes
-    if not wanted:
-        raise InputError(
-            "no scene in it",
-            file=sheet(settings, "scenes"),
-            remedy="stereotruth scene add DELIVERY --lidar FOLDER",
-        )
+    found = chosen(cities, scenes, known, sheet(settings, "scenes"))
+    wanted = [city for city in known if any(scene.city == city for scene in found.values())]
     of_city = "tiles/{0}", "results/report/{0}/index.html"
     targets = [target.format(city) for city in wanted for target in of_city]
     jobs = plan([*targets, "evaluate"], configfiles)

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from .delaunay import Triangles
 from .feasible_lines import (
     MOST_CORNERS,
@@ -47,10 +48,7 @@ from .feasible_lines import (
 from .scale import BREAKLINE_REACH, PART, SurfaceScale, height_steps
 from .vertices import Vertices
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
-Bools = NDArray[np.bool_]
 Corners = tuple[int, int, int]  # of a triangle
 
 NEAR_SPACINGS = 3.0  # within which points determine heights and the direction of a step

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Floats, Ints
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 Places = NDArray[np.int32]
 

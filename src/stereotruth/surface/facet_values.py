@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import corner_shares, plane_slopes
 from .vertices import Vertices
 
-Floats = NDArray[np.float64]
 Steps = NDArray[np.int32]
 
 

@@ -19,14 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from .delaunay import Triangles
 from .scale import HEIGHT_NOISE_M, PART, PRIOR_NOISE_M, SurfaceScale, height_steps
 from .vertices import Vertices
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
-Bools = NDArray[np.bool_]
 
 # The slopes of a triangle count if it is no sliver: least altitude in spacings, and in cells.
 SLIVER_SPACINGS = 0.25

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from .scale import PART, PART_BITS
 from .vertices import Vertices
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Steps = NDArray[np.int32]
 
 BACK = 1.5  # spacings before a corner: the last points are left out, they may lie beyond it
@@ -31,7 +30,6 @@ MOST_CORNERS = 24  # of the polygon of feasible lines
 POLYGONS = 64  # that are kept while they are clipped
 RINGS = 32  # by which points are sorted
 
-Ints = NDArray[np.int64]
 
 BLOCK_BITS = PART_BITS + 3  # of parts of a cell: vertices of a row are found by such blocks
 MOST_STEP_POINTS = 4096  # that determine a breakline, at most

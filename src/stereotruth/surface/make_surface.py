@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import BinaryIO, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.job import progress
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.products.files import atomic_file, atomic_folder, link, sealed
 from ..core.products.grids import Strip
 from ..core.products.making import FileLock, marks_of_inputs, refuse_replaced
@@ -41,7 +41,6 @@ from .surface_store import ATTRIBUTES, BLOCKS, CONTENTS, FORMAT, GROUPS, GroupWr
 from .vertices import VertexBuilder
 
 log = logging.getLogger("stereotruth")
-Ints = NDArray[np.int64]
 Number = tuple[int, int]  # of a block (row, col), of a cell (col, row)
 Box = tuple[Number, Number]
 Group = tuple[Number, ...]  # of blocks, in their order
@@ -51,8 +50,6 @@ BLOCK_CELLS = 256  # and cells
 HALOS = 12  # a group is so many halos wide: these cost a third more
 MOST_CELLS = 4096  # along a group's side
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 SQUARES = 8  # along the side of a block, each of which images show or not
 

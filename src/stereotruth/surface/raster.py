@@ -25,16 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from ..core.numerics.geometry import plane_slopes, row_span
 from ..epipolar.window_sums import SURFACE_PX
 from ..lidar.lattice import LATTICE_M
 from .facet_values import Facets, PixelValues, interpolate, triple
 from .surface import GroundSurface
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
-Bools = NDArray[np.bool_]
 
 # What lies in front of a surface by less is the surface itself.
 OCCLUSION_TOLERANCE_PX = 0.25

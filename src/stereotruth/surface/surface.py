@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Bools, Floats, Ints
 from .breaklines import Breaklines, breaklines
 from .delaunay import Triangles, height_ranges, triangulate
 from .facets import facets, height_variances
@@ -33,10 +34,7 @@ from .feasible_lines import clip
 from .scale import PART, ROUGH_REACH, SurfaceScale, height_steps
 from .vertices import Vertices
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
-Bools = NDArray[np.bool_]
 
 FACET_PARTS, STRIP_PARTS = 4, 3  # triangles that a cut triangle has at most
 

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.kernels import kernel
+from ..core.numerics.arrays import Bools, Ints
 from ..core.products.files import damaged_store, read_sealed
 from ..lidar.lattice import LATTICE_DEG
 from .delaunay import height_ranges
@@ -40,9 +41,7 @@ from .scale import PART, PART_BITS, SurfaceScale
 from .surface import GroundSurface, RoughTops
 from .vertices import Vertices, whole_quotient
 
-Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
-Bools = NDArray[np.bool_]
 
 SQUARE_BITS = PART_BITS + 4  # of parts of a cell: squares of 16 cells
 

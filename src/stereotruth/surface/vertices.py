@@ -15,16 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.kernels import inlined, inner, kernel
+from ..core.numerics.arrays import Bytes, Ints
 from .scale import PART, PART_BITS, SQUARE_CELLS, SquareGrid, SurfaceScale, height_steps
 
-Ints = NDArray[np.int64]
 Steps = NDArray[np.int32]
 
 FEWEST_VERTICES = 3  # of an even square
 FEWEST_AROUND = 36  # of the nine squares: a quarter of their cells
 _SIDE = SQUARE_CELLS * PART
 
-Bytes = NDArray[np.uint8]
 Days = NDArray[np.uint16]
 
 _LOWEST = np.iinfo(np.int32).min

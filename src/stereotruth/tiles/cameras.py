@@ -22,15 +22,14 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebpts1
-from numpy.typing import NDArray
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import for_readers
 from ..sensor.deliveries import Acquisition
 from ..sensor.rpc import RPC, SCALARS, VECTORS
 
-Floats = NDArray[np.float64]
 FIT, CHECK = chebpts1(8), np.linspace(-1.0, 1.0, 11)  # places on each axis, in [-1, 1]
 # What is known of a camera before it is fitted: how far it is. A fit moves 1 / distance and the
 # direction of its axis, by PULL_PX_M, only for what it gains in the image; then small crops of flat

@@ -42,16 +42,12 @@ IMAGES = {"left": "left epipolar image", "right": "right epipolar image"}
 TIFF, JSON, TEXT = "image/tiff", "application/json", "text/plain"
 CROISSANT = "croissant.json"
 URL = "https://doi.org/10.1109/TGRS.2023.3245205"
+TEXT_FIELD = mlc.DataType.TEXT
 COLUMNS = {
-    "tile": mlc.DataType.TEXT,
-    "city": mlc.DataType.TEXT,
-    "scene": mlc.DataType.TEXT,
-    "split": mlc.DataType.TEXT,
+    **dict.fromkeys(("tile", "city", "scene", "split"), TEXT_FIELD),
     "right_offset_px": mlc.DataType.INTEGER,
     "labelled_share": mlc.DataType.FLOAT,
-    "left": mlc.DataType.TEXT,
-    "right": mlc.DataType.TEXT,
-    "disp": mlc.DataType.TEXT,
+    **dict.fromkeys(("left", "right", "disp"), TEXT_FIELD),
 }
 KINDS = {
     "left": ("left", "left epipolar image, the reference"),
@@ -77,10 +73,12 @@ def write_stac(
     orientations: Mapping[str, Path],
     footprints: Mapping[str, Mapping[str, Any]],
     acquired: Mapping[str, str],
+    licence: str,
 ) -> None:
     """Write the collection of the dataset in ``folder``; adds its files to the manifest's ``rows``.
 
-    ``orientations`` and ``footprints`` by tile, ``acquired``: dates by scene. Raises InputError for
+    ``orientations`` and ``footprints`` by tile, ``acquired``: dates by scene.
+    ``licence`` of the dataset. Raises InputError for
     what is no date.
     """
     root = folder / FOLDER
@@ -102,7 +100,7 @@ def write_stac(
         "stereotruth",
         "Epipolar pairs of satellite images with ground-truth disparity",
         pystac.Extent(pystac.SpatialExtent([whole]), pystac.TemporalExtent([span])),
-        license="other",
+        license=licence,
         keywords=["satellite stereo", "disparity", "LiDAR"],
         summaries=pystac.Summaries({f"{PREFIX}:split": sorted({row["split"] for row in rows})}),
     )
@@ -177,7 +175,7 @@ def _raster(
     RasterExtension.ext(asset, add_if_missing=True).apply(bands)
 
 
-def write_croissant(folder: Path) -> None:
+def write_croissant(folder: Path, licence: str) -> None:
     """Describe the dataset in ``folder``, whose manifest is written."""
     manifest = mlc.FileObject(
         id="manifest",
@@ -214,6 +212,7 @@ def write_croissant(folder: Path) -> None:
         name="stereotruth",
         description="Epipolar pairs of satellite images with ground-truth disparity",
         url=URL,
+        license=[licence],
         distribution=[manifest, *files],
         record_sets=[pairs],
     )

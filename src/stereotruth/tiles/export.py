@@ -33,7 +33,7 @@ from ..core.errors import InputError
 from ..core.job import progress
 from ..core.products.files import atomic_file, atomic_folder, growing_table, write_table
 from ..core.products.provenance import describe, file_sha256, own_digest, source_digest
-from .label_doubts import Doubt, doubts, flag, missed, surface_figures
+from .label_doubts import Doubt, doubts, flag, missed
 from .manifest import FOOTPRINTS, NONE, STATUS_COLOURS_FILE, column
 from .orientation import save
 from .quick_looks import (
@@ -398,7 +398,10 @@ def _gates(
     return {
         "limits": limits.model_dump(),
         "scenes": found,
-        "surfaces": {s: surface_figures(of.matches.biases) for s, of in scenes.items()},
+        "surfaces": {
+            scene: {bias.surface.replace(" ", "_"): bias.to_dict() for bias in of.matches.biases}
+            for scene, of in scenes.items()
+        },
         "doubts": {s: [d.to_dict() for d in of] for s, of in in_doubt.items() if of},
         "flagged_tiles": {r["tile"]: r["quality"] for r in labelled if r["quality"] != "ok"},
     }

@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from scipy.special import stdtr
 
 from ..core.config.configuration import Limits
+from ..core.numerics.arrays import Floats
 from ..core.numerics.statistics import TO_SIGMA, biweight
 from .label_surfaces import LabelSurface
 from .sift_matches import TileMatches
-
-Floats = NDArray[np.float64]
 
 CELL_PX = 256  # px of the scene's grid
 MIN_CELLS = 5  # with fewer, by number or by weight, their scatter says nothing
@@ -229,11 +228,6 @@ def doubts(biases: Iterable[Bias], probability: float | None) -> list[Doubt]:
             explained = not unlikely
             found.append(Doubt(bias.surface, bias.sentence(explained), explained))
     return found
-
-
-def surface_figures(biases: Iterable[Bias]) -> dict[str, Any]:
-    """By surface, JSON-ready."""
-    return {bias.surface.replace(" ", "_"): bias.to_dict() for bias in biases}
 
 
 class Miss(NamedTuple):

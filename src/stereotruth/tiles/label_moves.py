@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Floats
 from ..core.products.files import atomic_file
 from ..core.products.grids import blocks, require_complete
 from ..epipolar.model import EpipolarModel
-
-Floats = NDArray[np.float64]
 
 KEPT = Path(".snakemake", "stereotruth", "labels")
 SAMPLES = 40_000  # labels of a scene at most, evenly thinned: 1.3 MB

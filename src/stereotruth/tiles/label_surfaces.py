@@ -32,10 +32,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import map_coordinates
 
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.geometry import DEGREE_M
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Codes = NDArray[np.uint8]  # LAS classes (ASPRS)
 
 GROUND_CODE, BUILDING_CODE, VEGETATION_CODES = 2, 6, (3, 4, 5)

@@ -10,8 +10,6 @@ import logging
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -38,6 +36,8 @@ from .quick_looks import read_footprints, write_footprints
 from .splits import shared_ground
 
 log = logging.getLogger("stereotruth")
+Image, Labels = NDArray[Any], NDArray[np.float32]  # [h, w] or [h, w, 3]; px, NaN: none
+Written = tuple[dict[str, str], dict[str, Any]]  # files by kind, and what else its line says
 
 README = """Stereo pairs with ground-truth disparity, in the folder layout of WHU-Stereo
 
@@ -45,6 +45,8 @@ README = """Stereo pairs with ground-truth disparity, in the folder layout of WH
   without ground truth/{{left,right}}       pairs whose labels are incomplete
 
 {counts}
+
+Licence: {licence}
 
 Conventions
 - left: the reference; right: the other view; which of them looks backward is said in orientation.
@@ -98,11 +100,12 @@ def assemble_dataset(
     *,
     catalogs: Sequence[str] = (),
     acquired: Mapping[str, str] | None = None,
+    licence: str = "other",
 ) -> dict[str, Any]:
     """Copy the cities' tiles to ``out`` in the published layout, with a manifest and a README.
 
     ``catalogs``: stac, croissant, see :mod:`.catalogs`; ``acquired``:
-    dates by scene.
+    dates by scene; ``licence`` of the dataset.
 
     Each file is held against its manifest's checksum on the way. Tiles of split ``none`` (they
     share ground with two splits) stay behind. Returns counts by folder, and the pairs of tiles
@@ -145,11 +148,11 @@ def assemble_dataset(
         write_footprints(scratch, footprints.values())
         if rows and "stac" in catalogs:
             where = {row["tile"]: at / row["orientation"] for at, row, *_ in todo}
-            _catalogs("stac").write_stac(scratch, rows, where, footprints, acquired or {})
+            _catalogs("stac").write_stac(scratch, rows, where, footprints, acquired or {}, licence)
         if rows:
             write_table(scratch / "manifest.csv", rows)
         if rows and "croissant" in catalogs:
-            _catalogs("croissant").write_croissant(scratch)
+            _catalogs("croissant").write_croissant(scratch, licence)
         labelled = (row for _, row, _, kinds in todo if "disp" in kinds)
         largest = max((float(row["disparity_rounding_px"]) for row in labelled), default=0.0)
         text = README.format(
@@ -157,6 +160,7 @@ def assemble_dataset(
             nodata=" or ".join(sorted(nodata)),
             rounding=f"Stored values are rounded by at most {largest:.4f} px.",
             shared=f"Except: {shared}." if shared else "",
+            licence=licence,
         )
         (scratch / "README.txt").write_text(text, encoding="utf-8")
     for place, count in sorted(counts.items()):
@@ -214,17 +218,6 @@ def _copy(
 # ------------------------------------------------------------------ other layouts
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """A labelled pair of the dataset: images [h, w] or [h, w, 3], disparity px with NaN."""
-
-    row: Mapping[str, str]
-    left: NDArray[Any]
-    right: NDArray[Any]
-    disparity: NDArray[np.float32]
-    layers: Mapping[str, NDArray[Any]]  # agl, class: of those that the dataset has
-
-
 def write_layout(
     dataset: str | Path, out: str | Path, layout: str, *, licence: str = "other"
 ) -> int:
@@ -236,9 +229,13 @@ def write_layout(
     """
     dataset = Path(dataset)
     rows = [row for row in read_manifest(dataset) if row["disp"]]
+
+    def load(row: Mapping[str, str]) -> packages.Sample:
+        images = (read_image(dataset / row[view]) for view in ("left", "right"))
+        return packages.sample_of(row, *images, read_labels(dataset / row["disp"])[0])
+
     with atomic_folder(out) as scratch:
         if layout in packages.NAMES:
-            load = partial(_sample, dataset)
             table = packages.write_packages(scratch, rows, load, layout, licence)
         else:
             reported = progress(rows, len(rows), f"dataset as {layout}: pairs")
@@ -250,24 +247,18 @@ def write_layout(
     return len(rows)
 
 
-def _sample(dataset: Path, row: Mapping[str, str]) -> packages.Sample:
-    images = (read_image(dataset / row[view]) for view in ("left", "right"))
-    return packages.sample_of(row, *images, read_labels(dataset / row["disp"])[0])
-
-
 def _write_pair(
     dataset: Path, row: Mapping[str, str], scratch: Path, layout: str
 ) -> dict[str, Any]:
     """Write a pair in the layout of kitti or us3d; its line of the manifest."""
-    images = (read_image(dataset / row[view]) for view in ("left", "right"))
+    images = [read_image(dataset / row[view]) for view in ("left", "right")]
     disparity = read_disparity(dataset / row["disp"], float(row["disparity_nodata"]))
-    layers = {
-        name: read_labels(dataset / row[column(name)])[0]
-        for name in US3D_TRUTH
-        if row.get(column(name))
-    }
-    pair = _Pair(row, *images, disparity, layers)
-    files, said = {"kitti": _kitti, "us3d": _us3d}[layout](scratch, pair)
+    if layout == "kitti":
+        files, said = _kitti(scratch, row, images, disparity)
+    else:
+        there = [name for name in US3D_TRUTH if row.get(column(name))]
+        layers = {name: read_labels(dataset / row[column(name)])[0] for name in there}
+        files, said = _us3d(scratch, row, images, disparity, layers)
     record = {name: row[name] for name in KEPT if name in row} | said
     for kind, name in files.items():
         record |= {kind: name, f"{kind}_sha256": file_sha256(scratch / name)}
@@ -284,12 +275,6 @@ def _put_png(path: Path, image: NDArray[Any]) -> None:
         raise InputError("cannot be written", file=path, remedy="see that there is space")
 
 
-def shift_of(disparity: NDArray[np.float32]) -> int:
-    """By how many px a right image is moved so that no disparity is below 1 px."""
-    known = disparity[np.isfinite(disparity)]
-    return max(0, int(np.ceil(1.0 - float(known.min())))) if known.size else 0
-
-
 def moved(image: NDArray[Any], shift: int) -> NDArray[Any]:
     """An image moved to the left by ``shift`` px; 0 comes in from the right."""
     out = np.zeros_like(image)
@@ -298,53 +283,61 @@ def moved(image: NDArray[Any], shift: int) -> NDArray[Any]:
     return out
 
 
-def _kitti(folder: Path, pair: _Pair) -> tuple[dict[str, str], dict[str, Any]]:
-    shift = shift_of(pair.disparity)
-    steps = np.rint((pair.disparity.astype(np.float64) + shift) * KITTI_STEPS)
+def _kitti(
+    folder: Path, row: Mapping[str, str], images: Sequence[Image], disparity: Labels
+) -> Written:
+    known = disparity[np.isfinite(disparity)]
+    shift = max(0, int(np.ceil(1.0 - float(known.min())))) if known.size else 0  # none below 1 px
+    steps = np.rint((disparity.astype(np.float64) + shift) * KITTI_STEPS)
     beyond = steps > 65535
     steps = np.where(np.isfinite(steps) & ~beyond, steps, 0.0).astype(np.uint16)
-    split, tile = KITTI_SPLITS[pair.row["split"]], pair.row["tile"]
+    split, tile = KITTI_SPLITS[row["split"]], row["tile"]
     files = {}
     for kind, place, image in (
-        ("left", "image_2", pair.left),
-        ("right", "image_3", moved(pair.right, shift)),
+        ("left", "image_2", images[0]),
+        ("right", "image_3", moved(images[1], shift)),
         ("disp", "disp_occ_0", steps),
     ):
         files[kind] = f"{split}/{place}/{tile}_10.png"
         _put_png(folder / files[kind], image)
     return files, {
         "shift_px": shift,
-        "right_offset_px": int(pair.row["right_offset_px"]) - shift,
+        "right_offset_px": int(row["right_offset_px"]) - shift,
         "labels_left_out": int(beyond.sum()),
     }
 
 
-def _us3d(folder: Path, pair: _Pair) -> tuple[dict[str, str], dict[str, Any]]:
-    values = np.concatenate([image[image != 0] for image in (pair.left, pair.right)])
+def _us3d(
+    folder: Path,
+    row: Mapping[str, str],
+    images: Sequence[Image],
+    disparity: Labels,
+    layers: Mapping[str, NDArray[Any]],
+) -> Written:
+    values = np.concatenate([image[image != 0] for image in images])
     limits = tuple(float(v) for v in np.percentile(values, (0.1, 99.9))) if values.size else (0, 1)
-    if pair.left.dtype == np.uint8:
+    if images[0].dtype == np.uint8:
         limits = (1.0, 255.0)  # as they are
-    split, tile = US3D_SPLITS[pair.row["split"]], pair.row["tile"]
+    split, tile = US3D_SPLITS[row["split"]], row["tile"]
     files = {}
-    for kind, ending in (("left", "LEFT_RGB"), ("right", "RIGHT_RGB")):
-        grey = pictures.stretch(getattr(pair, kind), limits=limits)
+    for kind, image in zip(("left", "right"), images):
+        grey = pictures.stretch(image, limits=limits)
         bands = np.stack([grey] * 3) if grey.ndim == 2 else np.moveaxis(grey, -1, 0)
-        files[kind] = f"{split}-RGB/{tile}_{ending}.tif"
+        files[kind] = f"{split}-RGB/{tile}_{kind.upper()}_RGB.tif"
         (folder / files[kind]).parent.mkdir(exist_ok=True)
         write_tiff(folder / files[kind], np.ascontiguousarray(bands))
     files["disp"] = f"{split}-Truth/{tile}_LEFT_DSP.tif"
     (folder / files["disp"]).parent.mkdir(exist_ok=True)
-    known = np.isfinite(pair.disparity)
-    labels = np.where(known, pair.disparity, np.float32(-999))
+    labels = np.where(np.isfinite(disparity), disparity, np.float32(-999))
     write_tiff(folder / files["disp"], labels, nodata=-999)
-    for name, values in pair.layers.items():
+    for name, values in layers.items():
         ending, unknown = US3D_TRUTH[name]
         files[name] = f"{split}-Truth/{tile}_LEFT_{ending}.tif"
         nodata = KINDS[name].nodata
         values = np.where(values == nodata, np.asarray(unknown, values.dtype), values)
         write_tiff(folder / files[name], values, nodata=unknown)
     return files, {
-        "right_offset_px": int(pair.row["right_offset_px"]),
+        "right_offset_px": int(row["right_offset_px"]),
         "black": f"{limits[0]:g}",
         "white": f"{limits[1]:g}",
     }

@@ -26,10 +26,14 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.products.files import path_below, plain_name, read_table, shown
+from ..core.products.provenance import file_sha256
 from ..core.status import Status
 
 SPLITS = ("train", "val", "test")
@@ -43,6 +47,9 @@ PATHS = ("left", "right", "disp")  # columns of files, with all that have a chec
 WHOLE = ("row0", "col0", "size", "right_offset_px")
 SUM = "_sha256"  # ends the name of a checksum's column, which begins with that of the file
 MAKE_AGAIN = "get or make the folder again"
+CHANGED = "is not what its manifest has the checksum of"
+CHANGED_REMEDY = "get or make the dataset again; or delete the manifest, if the edit was yours"
+DISPARITY_FIGURES = ("disparity_min_px", "disparity_mean_px", "disparity_max_px")
 
 
 class LayerKind(NamedTuple):
@@ -163,6 +170,47 @@ def read_manifest(folder: str | Path) -> list[dict[str, str]]:
             "no manifest", file=path, remedy="make the folder with snakemake, tiles/<City>"
         )
     return list(manifest_rows(path))
+
+
+def listed_files(folder: str | Path) -> list[tuple[str, str]]:
+    """Files that a folder's manifest lists, as paths in the folder, with their checksums."""
+    return [
+        (row[key.removesuffix(SUM)], row[key])
+        for row in read_manifest(folder)
+        for key in row
+        if key.endswith(SUM) and row[key.removesuffix(SUM)]
+    ]
+
+
+def refuse_changed(folder: str | Path) -> None:
+    """Raise InputError that names a listed file which is another one than when it was listed.
+
+    Files that are not there, as those of a sealed copy, are passed over.
+    """
+    for name, checksum in listed_files(folder):
+        file = Path(folder, name)
+        if file.is_file() and file_sha256(file) != checksum:
+            raise InputError(CHANGED, file=file, remedy=CHANGED_REMEDY)
+
+
+def disparity_cells(
+    stored: NDArray[np.float32], disparity: NDArray[np.floating[Any]] | None = None
+) -> dict[str, str]:
+    """Cells that tell of labels [h, w] px, NaN without one, as their file has them.
+
+    ``disparity``: likewise, before it was rounded to be stored.
+    """
+    exact = stored if disparity is None else disparity
+    known = np.isfinite(exact)
+    values, match = stored[known].astype(np.float64), np.arange(exact.shape[1]) - exact
+    inside = (match >= -0.5) & (match <= exact.shape[1] - 0.5)
+    figures = (values.min(), values.mean(), values.max()) if values.size else ()
+    return {
+        "labelled_share": f"{known.mean():.6f}",
+        "matched_share": f"{inside.sum() / max(known.sum(), 1):.6f}",
+        **dict.fromkeys(DISPARITY_FIGURES, ""),
+        **{name: f"{value:.4f}" for name, value in zip(DISPARITY_FIGURES, figures)},
+    }
 
 
 def labelled_tiles(folder: Path, scene: str) -> list[Tile]:

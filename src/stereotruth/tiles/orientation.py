@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import for_readers, metres_per_degree
 
-Floats = NDArray[np.float64]
 Model = (
     Any  # stereotruth.epipolar.model.EpipolarModel, which whoever reads such a file need not have
 )

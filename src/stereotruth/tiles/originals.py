@@ -30,6 +30,7 @@ from rasterio.windows import Window
 
 from ..core.errors import InputError
 from ..core.job import progress
+from ..core.numerics.arrays import Floats
 from ..core.products.files import atomic_folder, write_table
 from ..core.products.grids import require_complete
 from ..core.products.provenance import file_sha256
@@ -43,7 +44,6 @@ from .cameras import Crop, Pair, Pinhole, local_frame, write_colmap, write_eogs,
 from .manifest import NODATA, LayerKind, read_manifest
 from .orientation import evaluate
 
-Floats = NDArray[np.float64]
 NO_CELLS = ("", None, None), ("", None, None)
 
 MARGIN_PX = 16  # of the crops around what the tiles show
@@ -257,25 +257,19 @@ def _crop(
         rpc = RPC.from_dict(record["corrected_rpc"])
         rpc = replace(rpc, samp_off=rpc.samp_off - low[0], line_off=rpc.line_off - low[1])
         options = {
+            "driver": "GTiff",
+            "width": cols,
+            "height": rows,
+            "count": source.count,
+            "dtype": source.dtypes[0],
+            "nodata": source.nodata,
             "photometric": "RGB" if source.colorinterp[0] == ColorInterp.red else "MINISBLACK",
             "compress": "deflate",
             "predictor": 1 if source.dtypes[0].startswith("float") else 2,
             "tiled": True,
         }
-        with (
-            rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
-            open_raster(
-                out,
-                "w",
-                driver="GTiff",
-                width=cols,
-                height=rows,
-                count=source.count,
-                dtype=source.dtypes[0],
-                nodata=source.nodata,
-                **options,
-            ) as target,
-        ):
+        masked = rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True)
+        with masked, open_raster(out, "w", **options) as target:
             window = Window(*low, cols, rows)
             target.write(source.read(window=window))
             if MaskFlags.per_dataset in source.mask_flag_enums[0]:

@@ -29,6 +29,7 @@ from rasterio.enums import ColorInterp
 from scipy.ndimage import distance_transform_edt
 
 from ..core.errors import in_number
+from ..core.numerics.arrays import Floats
 from ..core.products.rasters import read_disparity, read_image
 from ..core.status import BY_LABEL
 from ..pages import pictures
@@ -38,7 +39,6 @@ from .manifest import FOOTPRINTS, STYLE
 if TYPE_CHECKING:
     from .scene_stores import SceneStores
 
-Floats = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 CONTACT_TILES = 16  # most tiles on the contact sheet
@@ -111,7 +111,8 @@ def draw_coverage(
 def draw_contact_sheet(
     path: Path, city: str, rows: Sequence[Mapping[str, Any]], folder: Path, nodata: float
 ) -> None:
-    """Some of a city's labelled pairs, evenly drawn from all."""
+    """Some of a city's labelled pairs, evenly drawn from all: left, right and disparity in colour,
+    two tiles to a line."""
     labelled = [row for row in rows if row["complete"] == "yes"]
     picked = np.unique(np.linspace(0, len(labelled) - 1, CONTACT_TILES).round().astype(int))
     tiles = []
@@ -123,20 +124,6 @@ def draw_contact_sheet(
         tiles.append((row["tile"], *grey, disparity))
     values = np.concatenate([tile[3][np.isfinite(tile[3])] for tile in tiles])
     limits = tuple(float(v) for v in np.percentile(values, (1, 99)))
-    title = f"{city}: {len(tiles)} of {len(labelled)} labelled pairs"
-    contact_sheet(path, title, tiles, limits)
-
-
-def contact_sheet(
-    path: str | Path,
-    title: str,
-    tiles: Sequence[tuple[str, Picture, Picture, NDArray[np.floating]]],
-    limits: tuple[float, float],
-) -> None:
-    """Tiles of a city: left, right and disparity in colour, two tiles to a line.
-
-    ``tiles``: (caption, left, right, disparity in px with NaN), all small already.
-    """
     lines = -(-len(tiles) // 2)
     side = max(max(grey.shape) for _, grey, _, _ in tiles)
     step = side + GAP_PX
@@ -147,19 +134,20 @@ def contact_sheet(
     height = figure.get_figheight()
     axis = figure.add_axes((0.01, 0.05 / height, 6 * LINE_IN / 13.0, inches / height))
     for k, (caption, left, right, disparity) in enumerate(tiles):
-        row = k // 2 * step + GAP_PX
+        top = k // 2 * step + GAP_PX
         trio = (np.atleast_3d(left), np.atleast_3d(right), colours(disparity, limits))
         for n, (picture, name) in enumerate(zip(trio, (f"{caption}, left", "right", "disparity"))):
             col = (3 * (k % 2) + n) * step
             high, wide = picture.shape[:2]
-            sheet[row : row + high, col : col + wide] = picture
-            axis.text(col + side / 2, row - 4, name, fontsize=8, ha="center", va="bottom")
+            sheet[top : top + high, col : col + wide] = picture
+            axis.text(col + side / 2, top - 4, name, fontsize=8, ha="center", va="bottom")
     axis.imshow(sheet)
     axis.set_axis_off()
     mappable = ScalarMappable(cmap=pictures.DISPARITIES)
     mappable.set_clim(*limits)
     scale = figure.add_axes((0.94, 0.05 / height, 0.012, (inches - 0.3) / height))
     figure.colorbar(mappable, cax=scale, label="disparity, px (offset removed)")
+    title = f"{city}: {len(tiles)} of {len(labelled)} labelled pairs"
     figure.suptitle(title, y=1 - 0.25 / height)
     save_figure(path, figure)
 
@@ -308,7 +296,9 @@ def _write(
 
 def feature(row: Mapping[str, Any], ring: NDArray[np.float64]) -> dict[str, Any]:
     """A tile as a GeoJSON feature; ``row`` of the manifest, open ``ring`` [n, 2] of lon, lat."""
-    ring = ring if _area(ring) > 0 else ring[::-1]  # counter-clockwise
+    x, y = ring.T
+    if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) <= 0:
+        ring = ring[::-1]  # counter-clockwise
     corners = [[round(float(v), 8) for v in point] for point in (*ring, ring[0])]
     values = {name: row[name] or None for name in TEXTS}
     values["right_offset_px"] = int(row["right_offset_px"])
@@ -320,11 +310,6 @@ def feature(row: Mapping[str, Any], ring: NDArray[np.float64]) -> dict[str, Any]
         "geometry": {"type": "Polygon", "coordinates": [corners]},
         "properties": values,
     }
-
-
-def _area(ring: NDArray[np.float64]) -> float:
-    x, y = ring.T
-    return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def write_footprints(folder: Path, features: Iterable[Mapping[str, Any]]) -> None:

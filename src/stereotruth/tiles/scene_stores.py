@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import zarr
@@ -79,25 +79,11 @@ def tile_labels(store: zarr.Group, flags: Mapping[int, str], limit: float) -> di
     return {name: SureLabels(store, name, limit) for name in names}
 
 
-class Fit(Protocol):
-    """The fit of a view of an alignment."""
-
-    def rms(self, which: str) -> float:
-        """Of the GCPs' residuals, px, ``after`` the correction; NaN without GCPs."""
-
-
-class AlignmentNotes(Protocol):
-    """What an alignment says of labels, see :class:`stereotruth.align.alignment.Alignment`."""
-
-    fits: tuple[Fit, Fit]
-    warnings: tuple[str, ...]
-    refinement: Mapping[str, Any]
-
-
 class SceneFiles(NamedTuple):
     """What export reads of one scene: its id and stores, and what is known of it otherwise.
 
-    ``alignment``: its file, whose digest is for the record; ``notes``: what it says.
+    ``alignment``: its file, whose digest is for the record; ``notes``: what it says
+    (:class:`stereotruth.align.alignment.Alignment`).
     ``disparity_of_right``: the store of the right view's labels, if they are wanted. ``acquired``:
     days (ISO) of the left and right image by the images sheet, empty where their deliveries tell.
     """
@@ -109,7 +95,7 @@ class SceneFiles(NamedTuple):
     alignment: Path | None = None
     disparity_of_right: Path | None = None
     acquired: tuple[str, str] = ("", "")
-    notes: AlignmentNotes | None = None
+    notes: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +186,9 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         scene=item.scene,
         left=left["image"],
         right=right["image"],
-        colours=_colours(left, right),
+        colours=tuple(tuple(view[name] for name in COLOURS) for view in (left, right))
+        if all(name in view for view in (left, right) for name in COLOURS)
+        else None,
         disparity=sure["disparity"],
         status=sure["status"],
         height=disparity["height"],
@@ -224,13 +212,6 @@ def open_stores(item: SceneFiles, max_uncertainty_px: float = math.inf) -> Scene
         doubts=() if notes is None else tuple(notes.warnings),
         remark="" if notes is None else notes.refinement.get("remark", ""),
     )
-
-
-def _colours(*views: zarr.Group) -> tuple[tuple[zarr.Array, ...], ...] | None:
-    """Red, green and blue of both images; None where they are grey."""
-    if not all(name in view for view in views for name in COLOURS):
-        return None
-    return tuple(tuple(view[name] for name in COLOURS) for view in views)
 
 
 # ------------------------------------------------------------------ windows

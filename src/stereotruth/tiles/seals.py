@@ -27,7 +27,7 @@ from ..core.products.files import (
     write_table,
 )
 from ..core.products.provenance import file_sha256
-from .manifest import KINDS, PATHS, SUM, column, read_manifest
+from .manifest import KINDS, PATHS, SUM, column, read_manifest, refuse_changed
 
 FILE = "seal.json"
 MANIFEST = "manifest.csv"
@@ -75,7 +75,8 @@ class Seal:
 def seal_dataset(root: str | Path, pairs: Iterable[Any], split: str, to: str | Path) -> str:
     """Write a copy of a dataset without the labels of a split; what to say of it.
 
-    ``pairs``: all of the dataset (:class:`.stereo_dataset.Pair`); ``to``: a new folder.
+    ``pairs``: all of the dataset (:class:`.stereo_dataset.Pair`); ``to``: a new folder. Raises
+    InputError if a file is not the one that the dataset's manifest has the checksum of.
     """
     root, to = Path(root), Path(to)
     refuse_others(to, source=root)
@@ -92,7 +93,8 @@ def seal_dataset(root: str | Path, pairs: Iterable[Any], split: str, to: str | P
         raise InputError(
             f"no labelled pair of split {split!r}", file=root, remedy="name another split"
         )
-    has_manifest = (root / MANIFEST).is_file()
+    if has_manifest := (root / MANIFEST).is_file():
+        refuse_changed(root)
     with atomic_folder(to) as scratch:
         for file in (*kept, *(filter(Path.is_file, [root / README]))):
             _copy(file, scratch / file.relative_to(root))

@@ -38,12 +38,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.numerics.arrays import Bools, Floats
 from ..core.numerics.interpolation import bilinear
 from ..pages.pictures import stretch
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 
 
 WINDOW = 5  # px
@@ -96,17 +95,12 @@ class KeyPoints(NamedTuple):
         return KeyPoints(*(values[index] for values in self))
 
 
-def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+def picture_of(image: NDArray[Any]) -> NDArray[np.uint8]:
     """What key points are found in; 0 is nodata."""
     return stretch(image, percent=(0.1, 99.9))
 
 
-def key_points(image: NDArray[Any]) -> KeyPoints:
-    """Key points of an image (0 is nodata)."""
-    return _key_points(_grey(image))
-
-
-def _key_points(grey: NDArray[np.uint8], where: Bools | None = None) -> KeyPoints:
+def key_points(grey: NDArray[np.uint8], where: Bools | None = None) -> KeyPoints:
     """Key points of a picture whose nearest pixel is in the mask ``where``."""
     mask = None if where is None else where.astype(np.uint8)
     found, descriptors = cv2.SIFT_create(enable_precise_upscale=True).detectAndCompute(grey, mask)
@@ -262,7 +256,7 @@ def _match_band(
         return np.empty((4, 0))
     near = (row >= first - ROW_SEARCH_PX - 1) & (row <= first + BAND + ROW_SEARCH_PX)
     there = np.broadcast_to(near, here.shape)
-    a, b = _key_points(left[rows], here), _key_points(right[rows], there)
+    a, b = key_points(left[rows], here), key_points(right[rows], there)
     if not (a.x.size and b.x.size):
         return np.empty((4, 0))
     i, j = match(a, b, reach)
@@ -280,7 +274,7 @@ def match_tile(
     reach = (0.0, 0.0)
     if known.any():
         reach = disparity[known].min() - MARGIN_PX, disparity[known].max() + MARGIN_PX
-    where, images = constant_labels(disparity), tuple(map(_grey, (left, right)))
+    where, images = constant_labels(disparity), tuple(map(picture_of, (left, right)))
     bands = range(0, len(left), BAND)
     found: dict[int, Floats] = {}
     for part in (bands[::EVERY], bands):

@@ -34,7 +34,7 @@ from ..core.errors import InputError, in_number, install_extra
 from ..core.products.files import files_below, plain_name, read_sealed
 from ..core.products.provenance import file_sha256
 from ..core.products.rasters import read_disparity, read_image, read_labels
-from .manifest import NO_TRUTH, NONE, PATHS, SPLITS, SUM, manifest_rows
+from .manifest import CHANGED, CHANGED_REMEDY, NO_TRUTH, NONE, PATHS, SPLITS, SUM, manifest_rows
 from .manifest import column as column_of
 from .seals import Seal
 
@@ -74,24 +74,20 @@ class Pair:
     row: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
     sealed: str = field(default="", repr=False, compare=False)
 
-    def refuse_changed(self) -> None:
-        """Raise InputError if a file is not the one that the manifest has the checksum of."""
-        files = zip(PATHS, (self.left, self.right, self.disparity))
-        for column, file in files:
+    def changed(self) -> Iterator[InputError]:
+        """What is to be said of files that are not those which the manifest or the seal lists."""
+        for column, file in zip(PATHS, (self.left, self.right, self.disparity)):
             known = self.row.get(f"{column}{SUM}")
             if file is not None and known and file_sha256(file) != known:
-                raise InputError(
-                    "is not what its manifest has the checksum of",
-                    file=file,
-                    remedy="get or make the dataset again; or delete the manifest, if the edit "
-                    "was yours",
-                )
+                yield InputError(CHANGED, file=file, remedy=CHANGED_REMEDY)
         if self.sealed and self.disparity and file_sha256(self.disparity) != self.sealed:
-            raise InputError(
-                "is not the label that was sealed",
-                file=self.disparity,
-                remedy="open the seal again with the labels that it was made of",
-            )
+            remedy = "open the seal again with the labels that it was made of"
+            yield InputError("is not the label that was sealed", file=self.disparity, remedy=remedy)
+
+    def refuse_changed(self) -> None:
+        """Raise InputError if a file is not the one that the manifest has the checksum of."""
+        for error in self.changed():
+            raise error
 
 
 @dataclass(frozen=True)
@@ -291,7 +287,10 @@ def _of_manifest(root: Path, sealed: Collection[str]) -> Iterator[Pair]:
                 f"no column {error}", file=root / "manifest.csv", remedy="make the dataset again"
             ) from None
         for file in filter(None, files):
-            _require(file, root / "manifest.csv")
+            if not file.is_file():
+                raise InputError(
+                    f"{file} is missing", file=root / "manifest.csv", remedy="complete the dataset"
+                )
         yield Pair(name, city, split, *files, row)
 
 
@@ -361,11 +360,6 @@ def _beside(left: Path, stem: str, folder: str | None) -> Path | None:
 
 def _partner(left: Path, name: str) -> InputError:
     return InputError(f"its partner {name} is missing", file=left, remedy="complete the dataset")
-
-
-def _require(file: Path, named_in: Path) -> None:
-    if not file.is_file():
-        raise InputError(f"{file} is missing", file=named_in, remedy="complete the dataset")
 
 
 def _split(root: Path, file: Path) -> str:

@@ -21,7 +21,7 @@ from ..core.products.resumable_grids import Ledger
 from ..epipolar.intersection import intersect
 from ..epipolar.warping import agreement, warp_rows
 from .label_surfaces import Buildings, heights_above_ground, label_surfaces
-from .manifest import KINDS, NONE, column
+from .manifest import KINDS, NONE, column, disparity_cells
 from .orientation import orientation, save
 from .scene_stores import SceneStores, Window
 from .sift_matches import match_tile
@@ -43,7 +43,10 @@ def round_disparity(disparity: NDArray[np.floating], dtype: str) -> NDArray[np.f
 
 @dataclass(frozen=True)
 class City:
-    """A row of the cities sheet: a name, the prefix of its tiles, and tiles of table 3 by split."""
+    """A name, the prefix of its tiles, and tiles of table 3 by split.
+
+    As in the cities sheet, whose reader no code digest may hold.
+    """
 
     city: str
     prefix: str
@@ -320,9 +323,7 @@ def write_tile(
     sums["orientation"] = file_sha256(folder / files["orientation"])
 
     ring = np.array(record["footprint"]["coordinates"][0][:-1])
-    match = np.arange(cut.settings.size) - disparity
-    inside = (match >= -0.5) & (match <= cut.settings.size - 0.5)
-    values = crop.stored[known].astype(np.float64)
+    rounding = np.abs(crop.stored[known].astype(np.float64) - disparity[known])
     lon, lat = ring.mean(axis=0)
     row = {
         "tile": name,
@@ -335,14 +336,8 @@ def write_tile(
         "right_offset_px": window.offset,
         "complete": "yes" if window.labelled else "no",
         "split": NONE,
-        "labelled_share": f"{known.mean():.6f}",
-        "matched_share": f"{inside.sum() / max(known.sum(), 1):.6f}",
-        "disparity_min_px": f"{values.min():.4f}" if values.size else "",
-        "disparity_mean_px": f"{values.mean():.4f}" if values.size else "",
-        "disparity_max_px": f"{values.max():.4f}" if values.size else "",
-        "disparity_rounding_px": (
-            f"{np.abs(values - disparity[known]).max():.6f}" if values.size else ""
-        ),
+        **disparity_cells(crop.stored, disparity),
+        "disparity_rounding_px": f"{rounding.max():.6f}" if rounding.size else "",
         "disparity_nodata": f"{cut.settings.nodata:g}",
         "lon": f"{turn(lon):.7f}",
         "lat": f"{lat:.7f}",

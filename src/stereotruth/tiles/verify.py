@@ -10,7 +10,7 @@ from pathlib import Path
 from ..core.errors import InputError
 from ..core.products.files import is_foreign, read_json
 from ..core.products.provenance import file_sha256, own_digest
-from .manifest import FOOTPRINTS, STATUS_COLOURS_FILE, STYLE, SUM, read_manifest
+from .manifest import FOOTPRINTS, STATUS_COLOURS_FILE, STYLE, listed_files
 
 log = logging.getLogger("stereotruth")
 
@@ -27,13 +27,13 @@ def defects(folder: str | Path) -> list[str]:
     """What differs from the manifest: ``missing``, ``changed`` or ``not in the manifest`` files.
 
     ``export.json`` keeps its own digest, and those of the manifest and the footprints. Works on
-    ``tiles/<City>`` and on ``dataset``. Files of other programs (:func:`foreign_files`) are no
-    defects. Raises InputError if there is no manifest.
+    ``tiles/<City>`` and on ``dataset``. Files of other programs are no defects. Raises InputError
+    if there is no manifest.
     """
     folder = Path(folder)
     found = []
     listed = set()
-    for name, checksum in _listed(folder):
+    for name, checksum in listed_files(folder):
         listed.add(name)
         if not (folder / name).is_file():
             found.append(f"{name}: missing")
@@ -44,7 +44,7 @@ def defects(folder: str | Path) -> list[str]:
     present = {
         p.relative_to(folder).as_posix()
         for p in files
-        if not p.name.startswith(".") and not _is_foreign(p)
+        if not p.name.startswith(".") and (p.name == STYLE or not is_foreign(p.name))
     }
     found += [
         f"{name}: not in the manifest"
@@ -66,32 +66,11 @@ def defects(folder: str | Path) -> list[str]:
     return found
 
 
-def _listed(folder: Path) -> list[tuple[str, str]]:
-    """Files of a folder that its manifest lists, with their checksums."""
-    return [
-        (row[key.removesuffix(SUM)], row[key])
-        for row in read_manifest(folder)
-        for key in row
-        if key.endswith(SUM) and row[key.removesuffix(SUM)]
-    ]
-
-
-def _is_foreign(path: Path) -> bool:
-    return path.name != STYLE and is_foreign(path.name)
-
-
-def foreign_files(folder: str | Path) -> list[str]:
-    """Files that other programs have left in a folder of tiles, as paths in it, sorted."""
-    folder = Path(folder)
-    files = (p for p in folder.rglob("*") if p.is_file() and _is_foreign(p))
-    return sorted(p.relative_to(folder).as_posix() for p in files)
-
-
 def verify(folders: Iterable[str | Path]) -> dict[str, int]:
     """Check folders; the number of files that the manifest of each lists.
 
-    Files of other programs are named in the log and left alone. Raises InputError, after all were
-    looked at, naming the files that do not agree.
+    Files of other programs are left alone. Raises InputError, after all were looked at, naming the
+    files that do not agree.
     """
     counts, bad = {}, []
     for folder in map(Path, folders):
@@ -99,19 +78,13 @@ def verify(folders: Iterable[str | Path]) -> dict[str, int]:
         bad += [f"{folder}/{line}" for line in found]
         for line in found:
             log.error("%s/%s", folder, line)
-        counts[str(folder)] = count = len(_listed(folder))
-        if foreign := foreign_files(folder):
-            more = f" and {len(foreign) - 5} more" if len(foreign) > 5 else ""
-            log.info(
-                "%s: files of other programs, left alone: %s%s",
-                *(folder, ", ".join(foreign[:5]), more),
-            )
+        counts[str(folder)] = count = len(listed_files(folder))
         if not found:
             log.info("%s: %d files as in the manifest", folder, count)
     if bad:
         more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
         raise InputError(
             f"{len(bad)} files differ from the manifests: {'; '.join(bad[:5])}{more}",
-            remedy="delete the folder and make it again with snakemake",
+            remedy="delete the folder and make it again (stereotruth run tiles/<City>)",
         )
     return counts

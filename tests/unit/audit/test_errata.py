@@ -188,6 +188,10 @@ def download(tmp_path):
 def test_a_download_is_copied_with_its_labels_corrected(download, tmp_path):
     root, file = download
     row = {"disp": "test/disp/KM_disparity_1.tiff", "disp_sha256": file_sha256(file)}
+    row |= {"labelled_share": "0.981481", "disparity_min_px": "3.2500", "quality": "ok"}
+    row |= {"tile": "KM_1"}
+    place = {"id": "KM_1", "properties": {"disparity_min_px": 3.25, "split": "test"}}
+    (root / "footprints.geojson").write_text(json.dumps({"features": [place]}))
     write_table(root / "manifest.csv", [row])
     before = file.read_bytes()
     mask = np.zeros((6, 9), np.uint8)
@@ -202,7 +206,13 @@ def test_a_download_is_copied_with_its_labels_corrected(download, tmp_path):
     for name in ("left/KM_left_1.tiff", "right/KM_right_1.tiff"):
         assert (out / "test" / name).read_bytes() == (root / "test" / name).read_bytes()
     (renewed,) = read_table(out / "manifest.csv")
-    assert renewed["disp_sha256"] == file_sha256(out / row["disp"])
+    assert renewed == row | {
+        "disp_sha256": file_sha256(out / row["disp"]),
+        "labelled_share": f"{52 / 54:.6f}",
+        "disparity_min_px": "5.0000",
+    }
+    (place,) = json.loads((out / "footprints.geojson").read_text())["features"]
+    assert place["properties"]["disparity_min_px"] == 5.0 and place["properties"]["split"] == "test"
 
 
 def test_kitti_files_stay_such(tmp_path):
@@ -218,7 +228,7 @@ def test_kitti_files_stay_such(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "fault", ["other file", "no file", "other mask", "edited", "there", "path"]
+    "fault", ["other file", "no file", "other mask", "edited", "there", "path", "not listed"]
 )
 def test_what_does_not_fit_is_refused_by_name(fault, download, tmp_path):
     root, file = download
@@ -233,6 +243,10 @@ def test_what_does_not_fit_is_refused_by_name(fault, download, tmp_path):
     elif fault == "other mask":
         named = delta / "masks/KM_1.png"
         named.write_bytes(named.read_bytes() + b"\0")
+    elif fault == "not listed":  # of the manifest; the errata are not of it
+        named = root / "test/left/KM_left_1.tiff"
+        row = {"left": "test/left/KM_left_1.tiff", "left_sha256": 64 * "0"}
+        write_table(root / "manifest.csv", [row])
     elif fault in ("edited", "path"):
         named = delta / "errata.json"
         if fault == "edited":

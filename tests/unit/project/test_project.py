@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from stereotruth.project.project import (
     configured,
     days_of_pair,
     epoch_of_city,
-    read_mapping,
     read_scenes,
     stores_of,
 )
@@ -44,38 +42,6 @@ def test_files_of_the_folder_lie_over_the_defaults(tmp_path, monkeypatch):
     Path("other.yaml").write_text("seed: 3\n")
     settings, _ = configured(["other.yaml"])
     assert (settings.seed, settings.strict, settings.tiles.size) == (3, True, 1024)
-
-
-NINES = [", ".join([f"*a{n}"] * 9) for n in range(12)]
-NO_MAPPINGS = {
-    "half": b"a: [",
-    "a list": b"- a\n- b\n",
-    "UTF-16": "seed: 1\n".encode("utf-16"),
-    "aliases": "a0: &a0 [x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{NINES[n]}]\n" for n in range(11)),
-    "merged": "a0: &a0 {x: 1}\n"
-    + "".join(f"a{n + 1}: &a{n + 1} {{<<: [{NINES[n]}]}}\n" for n in range(11)),
-    "a circle": "a: &a [1, *a]\n",
-    "deep": "a: " + "[" * 5000 + "]" * 5000,
-    "large": "a: x" + "x" * 1_000_000,
-    "twice": "tiles: {size: 256}\nseed: 1\ntiles: {stride: 3}\n",
-    "twice inside": "tiles: {size: 256, size: 512}\n",
-}
-
-
-@pytest.mark.parametrize("kind", NO_MAPPINGS)
-def test_what_is_no_mapping_is_refused_at_once(tmp_path, kind):
-    text = NO_MAPPINGS[kind]
-    (tmp_path / "c.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
-    begun = time.process_time()
-    with pytest.raises(InputError, match=r"c\.yaml") as refused:
-        read_mapping(tmp_path / "c.yaml")
-    assert refused.value.remedy and time.process_time() - begun < 5
-
-
-def test_aliases_that_do_not_multiply_are_taken(tmp_path):
-    file = tmp_path / "c.yaml"
-    file.write_text("a: &a {b: 1}\nc: *a\nd:\n  <<: *a\n  e: 2\n")
-    assert read_mapping(file) == {"a": {"b": 1}, "c": {"b": 1}, "d": {"b": 1, "e": 2}}
 
 
 def test_synthetic_cities_are_known_in_any_folder(tmp_path, monkeypatch):

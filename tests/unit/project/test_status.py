@@ -31,8 +31,10 @@ def test_causes_are_said_once_and_what_follows_from_them_not_at_all():
 
 def test_figures_and_pages_are_listed_and_leave_tiles_up_to_date():
     page = PlannedJob("report_city", "A", "", "Missing output files: results/report/A/index.html")
-    status = CityStatus("A", "4 tiles", (), (page,))
-    assert status.state == "up to date" and status.why() == ["report_city 1"]
+    truth = PlannedJob("evaluate_truth", "A", "A-1", DIGESTS)
+    status = CityStatus("A", "4 tiles", (), (page, truth))
+    assert status.state == "up to date"
+    assert status.why()[0] == "evaluate_truth 1"  # the page was never made: nothing is due
     assert CityStatus("A", "4 tiles", (), (page, *JOBS)).why()[0] == (
         "align 3, refine 1, project 1, report_city 1"
     )

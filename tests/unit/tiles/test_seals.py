@@ -103,6 +103,17 @@ def test_labels_that_are_not_the_sealed_ones_open_nothing(dataset, tmp_path):
             pair.refuse_changed()
 
 
+def test_a_label_that_is_not_that_of_the_manifest_is_not_sealed(dataset, tmp_path):
+    (pair,) = dataset.pairs("train")
+    shutil.copyfile(pair.left, pair.disparity)
+    if pair.row:
+        with pytest.raises(InputError) as refused:
+            sealed(dataset, tmp_path / "copy")
+        assert refused.value.file == str(pair.disparity)
+    else:  # nothing tells
+        sealed(dataset, tmp_path / "copy")
+
+
 def test_a_list_that_was_exchanged_is_no_seal(dataset, tmp_path):
     copy = sealed(dataset, tmp_path / "copy")
     file = Path(copy.root) / FILE

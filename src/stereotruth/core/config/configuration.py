@@ -201,7 +201,7 @@ class Dataset(Section):
     extra `catalog`"""
 
     licence: Text = "other"
-    """of the dataset, for the cards of `webdataset` and `parquet`: a name that dataset hubs know,
+    """of the dataset, in its README, cards and catalogs: a name that dataset hubs know,
     such as `cc-by-4.0`; images and LiDAR have terms of their own, which bind it"""
 
     catalogs: tuple[Literal["stac", "croissant"], ...] = ()

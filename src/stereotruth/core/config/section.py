@@ -6,12 +6,15 @@ its limits, and the nearest name of an unknown key.
 
 from __future__ import annotations
 
+import math
 import re
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
+import yaml
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -26,11 +29,12 @@ from pydantic import (
     ValidationError,
 )
 
-from ..errors import InputError, did_you_mean
+from ..errors import InputError, did_you_mean, told_by_system
 from ..products.files import LONGEST_NAME
 
 Values = TypeVar("Values", bound=tuple)
 LONGEST_VALUE = 300  # characters of a value in messages
+MOST_BYTES, MOST_VALUES = 1_000_000, 200_000  # of a file of settings
 PATTERN = re.compile(r"\{[^{}]*\w[^{}]*\}")
 REPEATED = re.compile(r"(.+)\1{18}$")  # once more, and Snakemake takes it for an endless recursion
 AT_FIRST = re.compile("^(Input|String|Tuple|Dictionary|Value error,) ")  # of pydantic's messages
@@ -83,6 +87,77 @@ def name_of(characters: str) -> Any:
     """The type of names that paths are made of: so many of the ``characters`` (of a pattern)."""
     limits = StringConstraints(pattern=f"^[{characters}]+$", max_length=LONGEST_NAME)
     return Annotated[Text, limits, AfterValidator(not_repeated)]
+
+
+def read_mapping(file: Path) -> dict[str, Any]:
+    """The keys and values of a YAML file. Raises InputError, naming it, if it has none.
+
+    Refused are also keys that stand twice, and what grows beyond all measure when its aliases are
+    put in.
+    """
+    try:
+        if file.stat().st_size > MOST_BYTES:
+            raise InputError(
+                f"{file.stat().st_size / 1e6:.1f} MB are no configuration",
+                file=file,
+                remedy="name the file of the configuration",
+            )
+        loader = yaml.SafeLoader(file.read_text(encoding="utf-8-sig"))
+        node = loader.get_single_node()
+        _refuse_repeated_and_multiplied(node, file)
+        found = None if node is None else loader.construct_document(node)
+    except FileNotFoundError:
+        raise InputError("no such file", file=file, remedy="correct its path") from None
+    except (UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
+        kinds = {UnicodeDecodeError: "is no UTF-8", RecursionError: "is nested too deeply"}
+        raise InputError(
+            f"{kinds.get(type(error), 'cannot be read as YAML')} ({' '.join(str(error).split())})",
+            file=file,
+            remedy="correct what it names, and save it as UTF-8",
+        ) from None
+    except OSError as error:
+        raise told_by_system(error) or InputError(
+            f"cannot be read: {error.strerror}", file=file, remedy="see what lies there"
+        ) from None
+    if found is not None and not isinstance(found, dict):
+        raise InputError(
+            "is no mapping of keys to values", file=file, remedy="write it as key: value"
+        )
+    return found or {}
+
+
+def _refuse_repeated_and_multiplied(top: yaml.Node | None, file: Path) -> None:
+    """Raise InputError if a key stands twice in one mapping, of which YAML would take the last, or
+    if a document has more than MOST_VALUES with all aliases put in."""
+    counts: dict[int, float] = {}
+
+    def count(node: yaml.Node) -> float:
+        if id(node) in counts:
+            return counts[id(node)]
+        counts[id(node)] = math.inf  # of an alias to what it stands in
+        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
+        if isinstance(node, yaml.MappingNode):
+            lines: dict[str, int] = {}
+            for key, _ in parts:
+                name = key.value if isinstance(key, yaml.ScalarNode) else "<<"
+                line = key.start_mark.line + 1
+                if name in lines and name != "<<":
+                    raise InputError(
+                        f"{name!r} stands twice, in lines {lines[name]} and {line}",
+                        file=file,
+                        remedy="put what both have under one of them",
+                    )
+                lines[name] = line
+            parts = [part for pair in parts for part in pair]
+        counts[id(node)] = 1 + sum(map(count, parts))
+        return counts[id(node)]
+
+    if top is not None and count(top) > MOST_VALUES:
+        raise InputError(
+            f"more than {MOST_VALUES} values, with its aliases (*) put in",
+            file=file,
+            remedy="write out what the aliases stand for",
+        )
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

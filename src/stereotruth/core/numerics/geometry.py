@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..kernels import inner
+from .arrays import Floats
 
 DEGREE_M = 111_320.0
 """A degree of longitude at the equator; of latitude, to 0.7 % anywhere. For distances that are
@@ -17,7 +18,6 @@ SEAM_DEG = -177.6
 """Where longitudes jump by 360: the meridian near that of 180° with least land, so that places on
 both sides of the line of 180° have longitudes that are near to each other."""
 
-Floats = NDArray[np.float64]
 Three = tuple[float, float, float]
 
 

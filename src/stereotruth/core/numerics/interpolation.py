@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..kernels import inlined, inner
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
+from .arrays import Floats, Singles
 
 SIX_POINT_RADIUS = 3  # samples on either side that the six-point kernel weighs
 # Rows are taps, columns powers 3 to 0 of f: the kernel at f + 2, f + 1, f, 1 - f, 2 - f, 3 - f

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..kernels import inner
-
-Floats = NDArray[np.float64]
+from .arrays import Floats
 
 TO_SIGMA = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 TUKEY = 4.685  # standard deviations at which the biweight is 0: 95 % efficient for normal errors

@@ -21,6 +21,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 from rasterio.windows import Window
 
 from ..errors import InputError, in_number
+from ..numerics.arrays import Floats
 from .files import atomic_file
 from .remote_files import gdal_name
 
@@ -37,7 +38,6 @@ os.environ.setdefault("CPL_VSIL_CURL_ALLOWED_FILENAME", "none")
 os.environ.setdefault("GDAL_HTTP_MAX_RETRY", "4")  # of what is read by its parts
 os.environ.setdefault("GDAL_HTTP_RETRY_DELAY", "1")  # s, twice as long each time
 
-Floats = NDArray[np.float64]
 
 FILLS = (0, -1, -99, -999, -9999, -99999, -32767, -32768)  # and the ends of an integer type
 OFTEN = 10

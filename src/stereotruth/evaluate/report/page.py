@@ -155,6 +155,11 @@ def write_report(
         "headlines": headlines(rows, alignments, refined, truth_rows, export | since, height),
         "sizes": sizes,
         "height_m_per_px": height,
+        "heights_of_10_px": " … ".join(
+            dict.fromkeys(f"{10 * of(s.height_m for s in sizes.values()):.1f}" for of in (min, max))
+        )
+        if sizes
+        else "",
         "links": files.links(out),
         "provenance": provenance(made_of),
         "export": export,

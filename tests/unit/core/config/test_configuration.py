@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import time
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from stereobench.methods import kinds
 from stereotruth.core.config import configuration, methods
 from stereotruth.core.config.configuration import Configuration
+from stereotruth.core.config.section import read_mapping
 from stereotruth.core.errors import InputError
 
 
@@ -94,3 +96,35 @@ def test_sections_declare_and_compute_nothing():
             for node in section.body if isinstance(section, ast.ClassDef) else ():
                 if isinstance(node, ast.FunctionDef) and node.name != "of":
                     assert "validator" in ast.unparse(node.decorator_list[0]), node.name
+
+
+NINES = [", ".join([f"*a{n}"] * 9) for n in range(12)]
+NO_MAPPINGS = {
+    "half": b"a: [",
+    "a list": b"- a\n- b\n",
+    "UTF-16": "seed: 1\n".encode("utf-16"),
+    "aliases": "a0: &a0 [x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{NINES[n]}]\n" for n in range(11)),
+    "merged": "a0: &a0 {x: 1}\n"
+    + "".join(f"a{n + 1}: &a{n + 1} {{<<: [{NINES[n]}]}}\n" for n in range(11)),
+    "a circle": "a: &a [1, *a]\n",
+    "deep": "a: " + "[" * 5000 + "]" * 5000,
+    "large": "a: x" + "x" * 1_000_000,
+    "twice": "tiles: {size: 256}\nseed: 1\ntiles: {stride: 3}\n",
+    "twice inside": "tiles: {size: 256, size: 512}\n",
+}
+
+
+@pytest.mark.parametrize("kind", NO_MAPPINGS)
+def test_what_is_no_mapping_is_refused_at_once(tmp_path, kind):
+    text = NO_MAPPINGS[kind]
+    (tmp_path / "c.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    begun = time.process_time()
+    with pytest.raises(InputError, match=r"c\.yaml") as refused:
+        read_mapping(tmp_path / "c.yaml")
+    assert refused.value.remedy and time.process_time() - begun < 5
+
+
+def test_aliases_that_do_not_multiply_are_taken(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("a: &a {b: 1}\nc: *a\nd:\n  <<: *a\n  e: 2\n")
+    assert read_mapping(file) == {"a": {"b": 1}, "c": {"b": 1}, "d": {"b": 1, "e": 2}}

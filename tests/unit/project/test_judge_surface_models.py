@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from stereotruth.core.errors import InputError
 from stereotruth.evaluate.surface_models import score
+from stereotruth.project.judge import score_dsm
 from stereotruth.project.main import app
-from stereotruth.project.score_dsm import score_dsm
 
 from ...synthetic.analytic_town import CELL_M, Town
 from ...synthetic.exact_surface import write_heights
