@@ -85,10 +85,7 @@ def made(data, once, tmp_path_factory) -> Project:
 
 @pytest.fixture(scope="session")
 def toured(once) -> Path:
-    """A folder in which the commands of docs/tutorial.md have been given.
-
-    ``said.json``: of each its exit status and lines. ``demo``: the example, nothing made of it.
-    """
+    """A folder after the commands of docs/tutorial.md; said.json: status and lines of each."""
 
     def make(folder: Path) -> None:
         folder.mkdir()

@@ -26,17 +26,11 @@ def fresh(made, tmp_path) -> Project:
 
 
 @pytest.fixture
-def begin(fresh):
-    """Starts a run in ``fresh``; none is left behind."""
-    runs = []
-
-    def begun():
-        runs.append(start(fresh.folder, *ARGUMENTS))
-        return runs[-1]
-
-    yield begun
-    for run in runs:
-        kill(run, "tree")
+def run(fresh):
+    """A run in ``fresh``, which is not left behind."""
+    run = start(fresh.folder, *ARGUMENTS)
+    yield run
+    kill(run, "tree")
 
 
 def wait_for(condition, seconds: float = 600.0) -> None:
@@ -60,8 +54,7 @@ def test_a_run_in_strips_that_is_killed_again_and_again_gives_the_same_bytes(mad
 
 
 @linux
-def test_a_second_run_is_refused_until_the_first_has_ended(made, fresh, begin):
-    run = begin()
+def test_a_second_run_is_refused_until_the_first_has_ended(made, fresh, run):
     lock = fresh.folder / ".snakemake/run.lock"
     wait_for(lambda: (lock.exists() and lock.read_text()) or run.poll() is not None)
     second = fresh.snakemake(*ARGUMENTS)
