@@ -90,7 +90,7 @@ rule originals:
 
 rule dataset:
     input:
-        tiles=expand("tiles/{city}", city=CITIES),
+        tiles=tiles_of_dataset,
         originals=expand("originals/{city}", city=CITIES if SETTINGS.dataset.originals else []),
     output:
         directory("dataset"),

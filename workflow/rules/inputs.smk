@@ -1,7 +1,9 @@
 """Input functions: which files a stage takes of a scene or a city."""
 
 from functools import cache
+from importlib.util import find_spec
 
+from stereotruth.core.errors import install_extra
 from stereotruth.sensor.deliveries import files_beside
 
 
@@ -266,6 +268,18 @@ def cities_of_report():
         "if it was forgotten; or make tiles first (snakemake --cores 2 tiles/<City>), or ask for "
         "all these cities by --configfile config/config.yaml"
     )
+
+
+def tiles_of_dataset(wildcards):
+    """All cities' tiles. Packages that are missing are told before a dataset that is there goes."""
+    needs = {"stac": "pystac", "croissant": "mlcroissant", "parquet": "pyarrow"}
+    for asked in (*SETTINGS.dataset.catalogs, *SETTINGS.dataset.layouts):
+        if asked in needs and find_spec(needs[asked]) is None:
+            raise Refused(
+                f"dataset: {asked} needs {needs[asked]}, which is not installed. Remedy: "
+                f"{install_extra('catalog')}; or leave it out"
+            )
+    return expand("tiles/{city}", city=CITIES)
 
 
 def light_of(scene):

@@ -17,6 +17,7 @@ cores.
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import logging
 from collections.abc import Iterable, Mapping, Sequence
@@ -47,7 +48,14 @@ from .protocols import PROTOCOLS
 from .score_method import ScoringPlan, score
 from .scores import MIN_TILES, Scorer
 from .strata import Products, exact_truth
-from .submissions import Entry, offered, read_admitted, refuse_borrowed, write_admitted
+from .submissions import (
+    ADMITTED,
+    Entry,
+    offered,
+    read_admitted,
+    refuse_borrowed,
+    write_admitted,
+)
 from .tables import Figure, error_figures, of_figures
 from .tables import Table as Differences
 
@@ -80,12 +88,14 @@ class BoardSettings(Section):
 
 @dataclass(frozen=True)
 class Run:
-    """A submission and its scores: summary, and folders of its disparities and scores."""
+    """A submission and its scores: summary, folders of its disparities and scores, digests of its
+    disparities."""
 
     entry: Entry
     summary: Mapping[str, Any]
     maps: Path
     scores: Path
+    digests: frozenset[str]
 
     def sums(self, figure: str) -> Sums:
         """Sums by pair of a figure of all labelled pixels, holes filled."""
@@ -129,13 +139,17 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
     for place in places:
         try:
             entry = Entry.read(place, admitted)
-            refuse_borrowed(entry, [run.entry for run in taken])
-            taken.append(_score(folder, entry, tables))
+            run = _score(folder, entry, tables)
+            refuse_borrowed(entry, run.digests, [(of.entry, of.digests) for of in taken])
+            taken.append(run)
         except InputError as error:
             refused.append(_said(error, place))
             remedies.append(error.remedy)
             if place.name not in known:
                 admitted.pop(place.name, None)
+    for name in sorted(known.keys() - {place.name for place in places}):
+        refused.append({"file": name, "problem": "was admitted, and is not there any more"})
+        remedies.append(f"put it back, or take its line out of {ADMITTED}")
     if take_in:
         write_admitted(folder, admitted)
     for run in taken:
@@ -174,7 +188,8 @@ def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
     """A submission, made or taken, and scored; raises InputError if it is refused."""
     table = tables.get(entry.facts["dataset"])
     if table is None:
-        entry.refuse("dataset is none of this board's", f"take one of {', '.join(tables)}")
+        problem = f"dataset {entry.facts['dataset']} is none of this board's"
+        entry.refuse(problem, f"take one of {', '.join(tables)}: names are those of board.yaml")
     dataset, split = table.dataset, table.pairs[0].split
     entry.check_maps(dataset, table.pairs)
     work = folder / WORK / dataset.name / entry.name
@@ -189,14 +204,21 @@ def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
         hold_against(entry.scores, summary)
     shown = ((p.name, read_prediction(maps, p), table.truth(p)) for p in table.pairs)
     entry.refuse_doubts(summary["doubts"], dataset, shown)
-    return Run(entry, summary, maps, scores)
+    digests = frozenset(_digest(read_prediction(maps, pair)) for pair in table.pairs)
+    return Run(entry, summary, maps, scores, digests)
+
+
+def _digest(disparity: NDArray[np.float32]) -> str:
+    """Of the values of a map, whatever stood where it has none."""
+    return hashlib.sha256(np.where(np.isnan(disparity), np.nan, disparity).tobytes()).hexdigest()
 
 
 def _said(error: InputError, place: Path) -> dict[str, str]:
     """File, from the folder of submissions on, and what is said of it, without other paths."""
     file = Path(error.file) if error.file else place / "submission.json"
     inside = file if file.is_relative_to(place) else place / "submission.json"
-    problem = error.problem.splitlines()[0].replace(f"{place.parent}/", "")
+    lines = error.problem.splitlines()
+    problem = " ".join(dict.fromkeys((lines[0], lines[-1]))).replace(f"{place.parent}/", "")
     return {"file": inside.relative_to(place.parent).as_posix(), "problem": problem}
 
 

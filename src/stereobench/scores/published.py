@@ -103,8 +103,9 @@ PUBLISHED = {
 def training_data(of: Mapping[str, Any]) -> dict[str, str]:
     """The columns of TRAINING_COLUMNS for the summary of a method, ``scores.json``.
 
-    A method states ``trained_on`` in its entry. Known without that: methods that learn nothing,
-    MC-CNN, and networks that rule ``train`` trained, on the training pairs of a dataset.
+    A method states ``trained_on`` in its entry, () if it learns nothing. Known without that:
+    methods that learn nothing, MC-CNN, and networks that rule ``train`` trained, on the training
+    pairs of a dataset.
     """
     dataset, settings = of["dataset"], of["settings"]
     stated = list(settings.get("trained_on") or ())
@@ -114,7 +115,9 @@ def training_data(of: Mapping[str, Any]) -> dict[str, str]:
     elif not stated and settings["kind"] == "pandora" and settings.get("pipeline") == MCCNN:
         stated = [US3D]
     licence = settings.get("licence") or (of.get("identity") or {}).get("licence") or NOT_STATED
-    if not stated:
+    if not stated and settings.get("trained_on") is not None:
+        trained, seen = NOTHING, "no"
+    elif not stated:
         learns = settings["kind"] not in ("sgm", "pandora") or settings.get("pipeline")
         trained = NOT_STATED if learns else NOTHING
         seen = NOT_STATED if learns else "no"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,10 +92,14 @@ class Entry(Submission):
 
     def check_facts(self) -> None:
         """Raise InputError unless it states all that a board shows."""
-        for key in STATED:
-            value = self.facts.get(key)
-            if not isinstance(value, str) or value.strip() in ("", NOT_STATED):
-                self.refuse(f"{key} is not stated", f"write {key} into it, before it is admitted")
+        stated = {key: self.facts.get(key) for key in STATED}
+        if missing := [
+            key
+            for key, value in stated.items()
+            if not isinstance(value, str) or value.strip() in ("", NOT_STATED)
+        ]:
+            names = ", ".join(missing)
+            self.refuse(f"{names}: not stated", f"write {names} into it, before it is admitted")
         if not isinstance(self.facts.get("seed"), int | None):
             self.refuse("seed is no whole number", "write the seed of the training, or null")
         if not isinstance(self.program, dict):
@@ -122,7 +126,9 @@ class Entry(Submission):
                 self.refuse("missing: each pair counts", "submit all pairs of the split", file)
             with open_raster(file) as source:
                 raw, shape = source.read(), image_shape(pair.left)
-            if raw.shape != (1, *shape):
+            if len(raw) != 1:
+                self.refuse(f"has {len(raw)} bands", "submit one, the disparity", file)
+            if raw.shape[1:] != shape:
                 self.refuse(f"is {raw.shape[1:]} px, its image {shape}", "submit its size", file)
             if np.isinf(raw).any():
                 self.refuse("has infinite values", "write NaN where there is no disparity", file)
@@ -171,19 +177,18 @@ def write_admitted(folder: Path, admitted: Mapping[str, str]) -> None:
     write_table(folder / ADMITTED, rows, ("folder", "sha256"))
 
 
-def refuse_borrowed(entry: Entry, earlier: Iterable[Entry]) -> None:
-    """Raise InputError if an earlier submission has its identity, or its disparities."""
-    mine = _maps(entry)
-    for other in earlier:
+def refuse_borrowed(
+    entry: Entry, maps: Collection[str], earlier: Iterable[tuple[Entry, Collection[str]]]
+) -> None:
+    """Raise InputError if an earlier submission has its identity, or its disparities.
+
+    ``maps``: digests of disparities as they are read.
+    """
+    for other, its_maps in earlier:
         if other.facts["dataset"] != entry.facts["dataset"]:
             continue
         same = other.method == entry.method
         if same and other.facts.get("seed") == entry.facts.get("seed"):
             entry.refuse(f"is {' by '.join(entry.method)}, as {other.name} is", "state its seed")
-        if not same and mine & _maps(other):
+        if not same and not set(maps).isdisjoint(its_maps):
             entry.refuse(f"has the disparities of {other.name}", "submit one's own")
-
-
-def _maps(entry: Entry) -> set[str]:
-    """Checksums of disparity maps."""
-    return {sha256 for name, sha256 in entry.files.items() if name.endswith(SUFFIXES)}

@@ -276,6 +276,14 @@ def borrowed(folder: Path) -> str:
     return FILE
 
 
+def borrowed_with_nodata(folder: Path) -> str:
+    for n in PAIRS:
+        file = folder.parent / f"near/KM_{n}.tif"
+        write(folder / f"KM_{n}.tif", np.nan_to_num(read_disparity(file), nan=-999.0))
+    fact(scores=None)(folder)
+    return FILE
+
+
 def better_numbers(folder: Path) -> str:
     scores = stated(folder)["scores"]
     scores["cities"][0]["filled_epe_px"] -= 0.01
@@ -338,6 +346,7 @@ AT_THE_DOOR = {  # folders that come so, with checksums that hold
     "no training data": fact(trained_on="not stated"),
     "another's identity": fact(label="Near", by="Group near", seed=None),
     "another's disparities": borrowed,
+    "another's disparities, other nodata": borrowed_with_nodata,
     "another dataset": fact(dataset="another"),
     "a program without its lock": fact(program={"command": "x {left} {right} {out}"}),
     "a seed that is none": fact(seed="1"),
@@ -404,6 +413,9 @@ def test_a_refused_submission_is_admitted_once_it_is_mended(made, tmp_path):
     (place / ".snakemake_timestamp").touch()  # of the rule that packs
     assert make_board(top, take_in=True) == []
     assert (top / ADMITTED).read_text().startswith(before)
+    shutil.rmtree(place)
+    (line,) = make_board(top)
+    assert line.startswith("later: ") and ADMITTED in line
 
 
 def test_a_board_of_a_sealed_set_takes_no_other_labels(made, tmp_path):

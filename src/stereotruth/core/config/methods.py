@@ -200,8 +200,9 @@ class Method(Section):
     version: Text = ""
     """of the method, for `scores.json`"""
 
-    trained_on: Annotated[tuple[Text, ...], Unit("names")] = ()
-    """datasets that the method was trained on, named as in `benchmark.datasets`, for tables"""
+    trained_on: Annotated[tuple[Text, ...] | None, Unit("names")] = None
+    """datasets that the method was trained on, named as in `benchmark.datasets`, for tables; []: it
+    learns nothing; null: not stated"""
 
     seed: Annotated[Whole | None, Unit("whole number")] = None
     """of the training; methods of one label whose seeds differ are runs of one method on a
