@@ -196,7 +196,7 @@ class HeightRaster:
         return tuple(map(float, box[0]))
 
     def window(self, rows: slice, cols: slice) -> Singles:
-        """Singles in m of a window that may reach over the edges; NaN where there are none."""
+        """Heights in m of a window that may reach over the edges; NaN where there are none."""
         out = np.full((rows.stop - rows.start, cols.stop - cols.start), np.nan, np.float32)
         top, left = max(rows.start, 0), max(cols.start, 0)
         bottom, right = min(rows.stop, self.shape[0]), min(cols.stop, self.shape[1])
@@ -208,19 +208,19 @@ class HeightRaster:
         return out
 
     def _read(self, **how: Any) -> Floats:
-        """Singles in m by rasterio's ``window`` or ``out_shape``; NaN where there are none."""
+        """Heights in m by rasterio's ``window`` or ``out_shape``; NaN where there are none."""
         unit = self.to_wgs84.system.height_unit_m
         with open_raster(self.path) as source:
             return unit * Values(source, self.path, self.quantity, unit).read(**how)
 
     def decimated(self, most: int) -> tuple[Floats, float]:
-        """Singles in m at ``most`` cells along the longer side, and how many cells are one."""
+        """Heights in m at ``most`` cells along the longer side, and how many cells are one."""
         times = max(max(self.shape) / most, 1.0)
         shape = tuple(max(2, round(side / times)) for side in self.shape)
         return self._read(out_shape=shape), times
 
     def heights_at(self, lon: Floats, lat: Floats) -> Floats:
-        """Singles over the WGS 84 ellipsoid, m [n], bilinear; NaN where there is none.
+        """Heights over the WGS 84 ellipsoid, m [n], bilinear; NaN where there is none.
 
         Raises InputError for fill values around the places.
         """
@@ -249,7 +249,7 @@ class HeightRaster:
 
 @dataclass(frozen=True)
 class Window:
-    """Singles of a part of a raster, and how they are taken at any place.
+    """Heights of a part of a raster, and how they are taken at any place.
 
     ``heights`` [h, w] begin with the cell ``first`` (row, column).
     """
@@ -264,7 +264,7 @@ class Window:
         return col, -np.asarray(y) / self.cell_m[1] - self.first[0]
 
     def at(self, x: Floats, y: Floats) -> Floats:
-        """Singles at places, of any shape, bilinear; NaN where one of the four cells lacks."""
+        """Heights at places, of any shape, bilinear; NaN where one of the four cells lacks."""
         return bilinear(self.heights, *self.cells(x, y))
 
 

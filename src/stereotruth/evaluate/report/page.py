@@ -155,11 +155,7 @@ def write_report(
         "headlines": headlines(rows, alignments, refined, truth_rows, export | since, height),
         "sizes": sizes,
         "height_m_per_px": height,
-        "heights_of_10_px": " … ".join(
-            dict.fromkeys(f"{10 * of(s.height_m for s in sizes.values()):.1f}" for of in (min, max))
-        )
-        if sizes
-        else "",
+        "heights_of_10_px": _heights_of_10_px(sizes.values()),
         "links": files.links(out),
         "provenance": provenance(made_of),
         "export": export,
@@ -294,6 +290,12 @@ def _pixel_sizes(folder: Path, labelled: Sequence[Row]) -> dict[str, PixelSize]:
         if size := PixelSize.mean([folder / row["orientation"] for row in here[:20:4]]):
             found[scene] = size
     return found
+
+
+def _heights_of_10_px(sizes: Iterable[PixelSize]) -> str:
+    """Height in m that 10 px of disparity are: one figure, or the least and greatest of scenes."""
+    texts = [f"{10 * height:.1f}" for height in sorted(size.height_m for size in sizes)]
+    return " … ".join(dict.fromkeys(texts[:1] + texts[-1:]))
 
 
 def status_counts(row: Row) -> Counter[str]:
