@@ -232,33 +232,39 @@ class _Ended(NamedTuple):
 
 
 def _run(words: Sequence[str], output: Path) -> _Ended:
-    """Run a program to its end; it, and what it started, ends with the caller."""
+    """Run a program to its end; it, and what it started, ends with the caller.
+
+    Waits by psutil: an exception of a signal handler within ``subprocess.Popen.wait`` may leave a
+    lock of it held (CPython 3.11), for which the wait after the kill would wait for ever.
+    """
     start, most = time.perf_counter(), 0
+    status: int | None = None
     with output.open("wb") as stream:
-        process = subprocess.Popen(
+        process = psutil.Popen(
             words, stdin=subprocess.DEVNULL, stdout=stream, stderr=subprocess.STDOUT
         )
-    watched = psutil.Process(process.pid)
     try:
-        while process.poll() is None:
+        while True:
             held = 0
             with suppress(psutil.Error):
-                for each in (watched, *watched.children(recursive=True)):
+                for each in (process, *process.children(recursive=True)):
                     with suppress(psutil.Error):
                         held += each.memory_info().rss
             most = max(most, held)
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(POLL_SECONDS)
+            with suppress(psutil.TimeoutExpired):
+                status = process.wait(POLL_SECONDS) or 0  # none where the system keeps none
+                break
     finally:
-        if process.poll() is None:
+        if status is None:
             with suppress(psutil.Error):
-                for each in watched.children(recursive=True):
+                for each in process.children(recursive=True):
                     with suppress(psutil.Error):
                         each.kill()
-            process.kill()
+            with suppress(psutil.Error):
+                process.kill()
             process.wait()
     memory_mb = round(most / MB, 1) if most else None
-    return _Ended(process.returncode, time.perf_counter() - start, memory_mb)
+    return _Ended(status, time.perf_counter() - start, memory_mb)
 
 
 class FunctionMethod(UncertainMatcher):
