@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, install_extra
+from ..core.config.configuration import NEEDED
+from ..core.errors import InputError, require_packages
 from ..core.job import progress
 from ..core.products.files import atomic_folder, read_json, read_record, write_table
 from ..core.products.provenance import file_sha256
@@ -206,13 +207,9 @@ def catalogs_of(dataset: Path, rows: Iterable[Mapping[str, str]]) -> dict[str, A
 
 def _catalogs(wanted: str) -> ModuleType:
     """The module that writes catalogs, with libraries that not everyone needs."""
-    try:
-        from . import catalogs
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"dataset.catalogs: {wanted} needs {error.name}, which is not installed",
-            remedy=f"{install_extra('catalog')}; or leave it out",
-        ) from None
+    require_packages(f"dataset: {wanted}", NEEDED[wanted], "catalog")
+    from . import catalogs
+
     return catalogs
 
 
