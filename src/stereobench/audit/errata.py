@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import logging
 import math
-import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -37,6 +36,7 @@ from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.numerics.statistics import reweighted_fit, tukey_weights
 from stereotruth.core.products.files import (
     atomic_folder,
+    copy,
     files_below,
     is_foreign,
     path_below,
@@ -350,11 +350,9 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
     with atomic_folder(out) as scratch:
         for file in progress(files, len(files), f"{out}: files"):
             target = scratch / file.relative_to(dataset)
-            target.parent.mkdir(parents=True, exist_ok=True)
+            copy(file, target)
             if file in found:
                 _write_corrected(file, target, found[file], delta, none)
-            else:
-                shutil.copyfile(file, target)
         if has_manifest and found:
             _tell(scratch, dataset, {f.relative_to(dataset).as_posix() for f in found}, none)
     log.info("%s: labels of %s corrected", out, in_number(len(found), "pair"))
@@ -396,14 +394,14 @@ def _tell(folder: Path, dataset: Path, corrected: Collection[str], nodata: float
 def _cells(folder: Path, row: Mapping[str, str], nodata: float, limits: Limits) -> dict[str, Any]:
     """Cells of the manifest that tell of a pair's labels; their uncertainty is not known."""
     labels = read_disparity(folder / row["disp"], nodata)
-    if "quality" not in row:
-        return disparity_cells(labels)
-    images = (np.nan_to_num(read_tile(folder / row[view])) for view in ("left", "right"))
-    left, right = (np.rint(image).astype(np.uint16) for image in images)
-    none = np.zeros(labels.shape, np.uint8)
-    known = LabelsKnown(row["class"], none, none, none.astype(np.float64))
-    checks = check_labels(left, right, labels.astype(np.float64), known)
-    return disparity_cells(labels) | check_cells(checks, limits)
+    cells: dict[str, Any] = disparity_cells(labels)
+    if "quality" in row:
+        images = (np.nan_to_num(read_tile(folder / row[view])) for view in ("left", "right"))
+        left, right = (np.rint(image).astype(np.uint16) for image in images)
+        known = LabelsKnown(row["class"], *[np.zeros(labels.shape, np.uint8)] * 3)
+        checks = check_labels(left, right, labels.astype(np.float64), known)
+        cells |= check_cells(checks, limits)
+    return cells
 
 
 def _write_corrected(
