@@ -230,19 +230,13 @@ def add_scene(
 def _add_site(
     images: Sequence[Image], city: str, settings: Configuration, given: Mapping[str, str]
 ) -> list[str]:
-    """List the images of a site; its pairs are chosen next, with the options that are ``given``."""
+    """List those images of a site that are new; the next step has the options ``given``."""
     if not settings.images:
-        raise InputError("the configuration names no images sheet", remedy="set the key images")
+        remedy = "add images: images.tsv, a file with the columns image, city, file"
+        raise InputError("the configuration names no images sheet", remedy=remedy)
     cities, _, known = read_rows(settings)
-    paths = [image.path for image in images]
-    if {sheets.file_key(str(path)) for path in paths} & {
-        sheets.file_key(image.file) for image in known.values()
-    }:
-        raise InputError(
-            "has some of these images already",
-            file=settings.images,
-            remedy=f"stereotruth pairs {city}; or take their lines out, then add them",
-        )
+    listed = {sheets.file_key(image.file) for image in known.values()}
+    paths = [one.path for one in images if sheets.file_key(str(one.path)) not in listed]
     lines = _add_city(city, cities, Path(sheet(settings, "cities")))
     for name, path in sheets.store_names(paths).items():
         row = {"image": re.sub(r"[^A-Za-z0-9_-]", "-", name), "city": city, "file": path}

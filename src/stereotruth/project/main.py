@@ -175,10 +175,7 @@ def init(
 def scene_add(
     delivery: Annotated[
         list[Path],
-        typer.Argument(
-            help="Folder of the delivery, or left and right image; more "
-            "than two images are listed for stereotruth pairs."
-        ),
+        typer.Argument(help="Folder of the delivery, or left and right image, or many of a place."),
     ],
     lidar: Annotated[
         str,
@@ -356,6 +353,7 @@ def pairs(
 @app.command(
     context_settings=PASSED_ON,
     options_metavar="",
+    short_help="Make tiles, pages or datasets: all that [cyan]stereotruth targets[/cyan] lists.",
     help="Run the workflow in this folder, with its config.yaml; without a target it makes the "
     "tiles of all cities. [cyan]stereotruth targets[/cyan] lists what can be made. Any option goes "
     "to Snakemake as it is; where none says how many cores, it takes all. "

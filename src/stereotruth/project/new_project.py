@@ -68,8 +68,8 @@ def begin(folder: str | Path) -> str:
     (folder / "gcps").mkdir(parents=True)
     (folder / "config.yaml").write_text(configuration_text(), encoding="utf-8")
     for name, columns in (("scenes", Scene), ("cities", City), ("images", Image)):
-        every = columns is Image
-        header = "\t".join(f.name for f in fields(columns) if every or f.default is MISSING)
+        wanted = (f for f in fields(columns) if columns is Image or f.default is MISSING)
+        header = "\t".join(f.name for f in wanted)
         (folder / f"{name}.tsv").write_text(f"{header}\n", encoding="utf-8")
     return "stereotruth scene add DELIVERY --lidar FOLDER"
 
