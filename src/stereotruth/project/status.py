@@ -215,9 +215,12 @@ def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> No
 
 
 def compare_labels(old: Path, new: Path) -> Table:
-    """A table of the scenes of two folders `results`: how far labels have moved from the ``old`` to
-    the ``new``, and the control points of both. Raises InputError if they share no scene."""
-    headings = ("scene", "labels, px of disparity", "control points, px rms", "worst")
+    """A table of the scenes of two folders `results`: how far labels and heights have moved from
+    the ``old`` to the ``new``, and the control points of both.
+
+    Raises InputError if they share no scene.
+    """
+    headings = ("scene", "labels, px of disparity", "height, m", "control points, px rms", "worst")
     table = plain_table(headings, whole=("scene",))
     for store in sorted(new.glob("project/*/*.zarr")):
         if (before := old / store.relative_to(new)).is_dir():
@@ -225,7 +228,8 @@ def compare_labels(old: Path, new: Path) -> Table:
             name = f"{store.parent.name}/{store.stem}"
             records = [_alignment(results, name) for results in (old, new)]
             rms = " -> ".join(map(_rms, records))
-            cells = name, str(found or "none before"), rms, worst_point(records[1])[1]
+            moved = (found.disparities, found.heights) if found else ("none before", "")
+            cells = name, *moved, rms, worst_point(records[1])[1]
             table.add_row(*map(escape, cells))
     if not table.row_count:
         raise InputError(

@@ -107,7 +107,8 @@ def _moved(scenes: Mapping[str, Any]) -> list[Headline]:
     moved = {scene: Moves(**values) for scene, values in scenes.items()}
     if not moved:
         return []
-    text = f"{spread([of.median_px for of in moved.values()], '.3f')} px"
+    medians = [(of.median_px, of.height_median_m) for of in moved.values()]
+    text = ", ".join(f"{spread(of, '.3f')} {unit}" for of, unit in zip(zip(*medians), ("px", "m")))
     notes = [f"{scene}: {of}" if len(moved) > 1 else str(of) for scene, of in moved.items()]
     return [Headline("moved since the last run", text, "; ".join(notes))]
 
