@@ -13,7 +13,9 @@ from __future__ import annotations
 import ast
 import os
 import os.path
+import re
 import shlex
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
@@ -23,9 +25,10 @@ from pathlib import Path
 from typing import Any
 
 from stereotruth.core.config.section import PATTERN
-from stereotruth.core.errors import InputError, install_extra
+from stereotruth.core.errors import InputError, did_you_mean, install_extra
 
 IMPORTERS = ("import_module", "__import__", "spec_from_file_location", "run_path", "run_module")
+MAKES_NAMES = re.compile(rb"\b(globals|setattr|exec)\b")
 
 FOLDER = "folder"
 # keys of an entry that change no result
@@ -119,8 +122,9 @@ def _results(settings: Mapping[str, Any]) -> list[Path]:
 
 def _code(settings: Mapping[str, Any]) -> list[Path]:
     """The user's file, or all of the module's package, and what they import of the user's."""
-    place = place_of(settings.get("function", ""))[0]
+    place, attribute = place_of(settings.get("function", ""))
     if place.endswith(".py"):
+        _require(attribute, Path(place))
         return imported_files([Path(place)])
     top = place.partition(".")[0]
     try:
@@ -146,6 +150,34 @@ def _code(settings: Mapping[str, Any]) -> list[Path]:
     return imported_files(f.relative_to(here) if f.is_relative_to(here) else f for f in found)
 
 
+def _require(attribute: str, file: Path) -> None:
+    """Raise InputError if a file surely has nothing of this name; it is not run for that.
+
+    A file that cannot be read, takes all names of another one, or makes some as it runs, may.
+    """
+    name, bound = attribute.partition(".")[0], set()
+    try:
+        nodes = list(ast.walk(ast.parse(file.read_bytes())))
+    except (OSError, SyntaxError, ValueError, RecursionError):
+        return
+    for node in nodes:
+        match node:
+            case (
+                ast.FunctionDef(name=own) | ast.AsyncFunctionDef(name=own) | ast.ClassDef(name=own)
+            ):
+                bound.add(own)
+            case ast.Name(id=own, ctx=ast.Store()):
+                bound.add(own)
+            case ast.alias(name=own, asname=other):
+                bound.add(other or own.partition(".")[0])
+    if bound.isdisjoint({name, "*", "__getattr__"}) and not MAKES_NAMES.search(file.read_bytes()):
+        raise InputError(
+            f"it has no {attribute!r}",
+            file=file,
+            remedy=did_you_mean(attribute, sorted(bound), "name a function of the file"),
+        )
+
+
 def words_of(command: str) -> list[str]:
     """The words of a command, as a shell has them.
 
@@ -162,7 +194,12 @@ def words_of(command: str) -> list[str]:
 
 def _program(settings: Mapping[str, Any]) -> list[Path]:
     """The words of the command that are files, and what is named besides."""
-    words = map(Path, words_of(settings.get("command", "")))
+    words = [Path(word) for word in words_of(settings.get("command", ""))]
+    if "{" not in str(words[0]) and shutil.which(words[0]) is None:
+        raise InputError(
+            f"no program {str(words[0])!r} that this machine can run",
+            remedy="install it, or write its path as the first word of command",
+        )
     return sorted({*filter(Path.is_file, words), *map(Path, settings.get("files") or ())})
 
 
