@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-
 from ..align.control_points import COLUMNS, read_gcps
 from ..core.errors import InputError
 from ..core.numerics.geometry import metres_per_degree, turn
 from ..core.products.files import as_text
 from ..core.tables import Lines, Table, epoch_year
-from ..lidar.declared_crs import parse_crs
-from ..lidar.frames import WGS84_NAME, Epoch, Epochs
+from ..lidar.declared_crs import LidarCRS, degrees_of, parse_crs, unbound
+from ..lidar.frames import WGS84_ENSEMBLE, WGS84_NAME, Epoch, Epochs, datum_code
+from ..lidar.geoid import candidates_at, named
 from ..lidar.height_raster import Floats, HeightRaster
 from ..lidar.to_wgs84 import ToWGS84, check_area, transformation
 
@@ -76,12 +76,14 @@ def import_gcps(
     left: str = "",
     right: str = "",
     epoch: str = "",
+    ellipsoidal: bool = False,
 ) -> list[str]:
     """Write ``to`` from the files of another program; returns what was done, line by line.
 
     Points of a system whose frame is known to centimetres keep it, and ``to`` says it in its first
     lines, as ``epoch`` of the coordinates where it is given (:mod:`..align.control_points`).
-    Heights of rasters and geoids are brought to that frame.
+    Heights of rasters and geoids are brought to that frame. ``ellipsoidal``: heights are, if their
+    system does not say what they count from.
 
     Raises InputError that names file and line; nothing is written then.
     """
@@ -105,7 +107,12 @@ def import_gcps(
     if heights is not None and heights.suffix.lower() in TABLES:
         placed = to_itrf(points, crs, None, files[0], epoch, places_only=True)
         points, raster = with_heights(points, _in_own_frame(*placed[:2]), heights), None
-    points, transform, notes = to_itrf(points, crs, geoid, files[0], epoch)
+    if ellipsoidal and geoid is not None:
+        raise InputError(
+            "both --ellipsoidal and --geoid", file=files[0], remedy="give what the heights are"
+        )
+    ellipsoidal = ellipsoidal or said.get("heights") == "ellipsoidal"
+    points, transform, notes = to_itrf(points, crs, geoid, files[0], epoch, ellipsoidal=ellipsoidal)
     if raster is not None and (without := [p for p in points if math.isnan(p.height)]):
         surface = HeightRaster.open(raster, geoid, epochs=EPOCHS, whole=False)
         found = dict(zip((p.id for p in without), surface.heights_at(*_places(without)[:2])))
@@ -136,14 +143,16 @@ def to_itrf(
     epoch: str = "",
     *,
     places_only: bool = False,
+    ellipsoidal: bool = False,
 ) -> tuple[list[Point], ToWGS84 | None, list[str]]:
     """Points in longitude, latitude and ellipsoidal m, how they got there, and remarks.
 
     In ITRF2020 at EPOCHS where their frame is known to centimetres, else in WGS 84.
 
     ``crs``: EPSG code, compound code or WKT; none: they are degrees. ``epoch`` of the coordinates.
-    ``places_only``: heights are left as they are. Raises InputError as for LiDAR: see
-    :func:`.to_wgs84.transformation`.
+    ``places_only``: heights are left as they are. ``ellipsoidal``: so they are, if nothing is
+    declared. Raises InputError as for LiDAR (:func:`.to_wgs84.transformation`), and for heights of
+    a national plane system of which nobody says what they count from.
     """
     if not points:
         return [], None, []
@@ -160,8 +169,11 @@ def to_itrf(
     if places_only or not known.any():  # what heights count from is of no account
         system = replace(system, vertical_datum=None, ellipsoidal=True)
         geoid = None
-    elif not crs and geoid is None:  # as control points of a project have them
-        system = replace(system, ellipsoidal=True)
+    elif not system.has_vertical and geoid is None:
+        if not ellipsoidal and _is_national_plane(system):
+            raise _undecided(points, system, file)
+        if ellipsoidal or not crs:  # as control points of a project have them
+            system = replace(system, ellipsoidal=True)
     ends = np.array([[x.min(), y.min()], [x.max(), y.max()]])
     try:
         epochs = EPOCHS._replace(own=epoch_year(epoch))
@@ -186,6 +198,27 @@ def to_itrf(
         notes.append(f"heights brought to the ellipsoid by {geoid.name}")
     height = height if places_only else np.where(known, lifted, np.nan)
     return _placed(points, lon, lat, height), transform, [note for note in notes if note]
+
+
+def _is_national_plane(system: LidarCRS) -> bool:
+    """Whether it is projected, and of another datum than WGS 84: of a survey, with its heights."""
+    horizontal = unbound(system.horizontal)
+    return horizontal.is_projected and datum_code(horizontal.geodetic_crs) != WGS84_ENSEMBLE
+
+
+def _undecided(points: Sequence[Point], system: LidarCRS, file: Path) -> InputError:
+    """A refusal with the geoids that there are of the place."""
+    x, y, _ = _places(points)
+    place = degrees_of(system.horizontal, x.mean(), y.mean())
+    of_place = candidates_at(*map(float, place)) if place else []
+    return InputError(
+        f"heights of '{system.name}': nothing says what they count from, and heights of national "
+        "plane systems are orthometric as a rule",
+        file=file,
+        remedy="give --geoid GRID if they are"
+        + (f" (of the place PROJ knows {named(of_place)})" if of_place else "")
+        + ", or --ellipsoidal if they count from the ellipsoid",
+    )
 
 
 def _places(points: Sequence[Point]) -> Floats:
@@ -418,7 +451,10 @@ def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, str], li
         pixels = ((value[f"{v}_col"], value[f"{v}_row"]) for v in ("left", "right"))
         ground = value["lon"], value["lat"], value.get("height", math.nan)
         points.append(Point(cells[called["id"]], *ground, *pixels))
-    return points, _declared(table, crs), [f"{len(points)} points of {file.name}"]
+    said = _declared(table, crs)
+    if called.get("height") == "ellipsoidal_height":
+        said["heights"] = "ellipsoidal"
+    return points, said, [f"{len(points)} points of {file.name}"]
 
 
 def with_heights(points: Sequence[Point], ground: Sequence[Point], source: Path) -> list[Point]:

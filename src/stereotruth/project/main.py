@@ -230,6 +230,9 @@ def gcps_import(
     geoid: Annotated[
         Path | None, typer.Option(help="Geoid grid, if the heights are orthometric.")
     ] = None,
+    ellipsoidal: Annotated[
+        bool, typer.Option("--ellipsoidal", help="The heights count from the ellipsoid.")
+    ] = False,
     left: Annotated[str, typer.Option(help="Name of the left image in a .gcp file.")] = "",
     right: Annotated[str, typer.Option(help="Name of the right image in a .gcp file.")] = "",
     epoch: Annotated[
@@ -241,7 +244,15 @@ def gcps_import(
 
     _print(
         import_gcps(
-            files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right, epoch=epoch
+            files,
+            to,
+            heights=heights,
+            crs=crs,
+            geoid=geoid,
+            left=left,
+            right=right,
+            epoch=epoch,
+            ellipsoidal=ellipsoidal,
         )
     )
 
