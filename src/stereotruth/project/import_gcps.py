@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+
 from ..align.control_points import COLUMNS, read_gcps
 from ..core.errors import InputError
 from ..core.numerics.geometry import metres_per_degree, turn
