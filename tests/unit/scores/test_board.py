@@ -195,7 +195,7 @@ def test_a_program_whose_runs_differ_is_refused_unless_it_states_so(made, tmp_pa
     (program / "dice.py").write_text(
         "import csv, os, sys, cv2\n"
         "for left, _, out in csv.reader(open(sys.argv[1])):\n"
-        "    found = cv2.imread(left, -1) % 7 + os.urandom(1)[0] / 256\n"
+        "    found = cv2.imread(left, -1) % 7 + int.from_bytes(os.urandom(4)) / 2**32\n"
         "    cv2.imwrite(out, found.astype('float32'))\n"
     )
     (program / "requirements.lock").write_text("")
