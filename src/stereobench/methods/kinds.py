@@ -28,7 +28,6 @@ from stereotruth.core.config.section import PATTERN
 from stereotruth.core.errors import InputError, did_you_mean, install_extra
 
 IMPORTERS = ("import_module", "__import__", "spec_from_file_location", "run_path", "run_module")
-MAKES_NAMES = re.compile(rb"\b(globals|setattr|exec)\b")
 
 FOLDER = "folder"
 # keys of an entry that change no result
@@ -151,31 +150,18 @@ def _code(settings: Mapping[str, Any]) -> list[Path]:
 
 
 def _require(attribute: str, file: Path) -> None:
-    """Raise InputError if a file surely has nothing of this name; it is not run for that.
+    """Raise InputError if a file that is read, and not run, does not even say this name.
 
-    A file that cannot be read, takes all names of another one, or makes some as it runs, may.
+    A file that is not there, that takes names of another, or makes some as it runs, may have it.
     """
-    name, bound = attribute.partition(".")[0], set()
-    try:
-        nodes = list(ast.walk(ast.parse(file.read_bytes())))
-    except (OSError, SyntaxError, ValueError, RecursionError):
+    text = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else "*"
+    if re.search(
+        rf"\b{attribute.partition('.')[0]}\b|\*$|\bglobals\b|\bexec\b", text, re.MULTILINE
+    ):
         return
-    for node in nodes:
-        match node:
-            case (
-                ast.FunctionDef(name=own) | ast.AsyncFunctionDef(name=own) | ast.ClassDef(name=own)
-            ):
-                bound.add(own)
-            case ast.Name(id=own, ctx=ast.Store()):
-                bound.add(own)
-            case ast.alias(name=own, asname=other):
-                bound.add(other or own.partition(".")[0])
-    if bound.isdisjoint({name, "*", "__getattr__"}) and not MAKES_NAMES.search(file.read_bytes()):
-        raise InputError(
-            f"it has no {attribute!r}",
-            file=file,
-            remedy=did_you_mean(attribute, sorted(bound), "name a function of the file"),
-        )
+    names = re.findall(r"^(?:async )?(?:def|class) (\w+)", text, re.MULTILINE)
+    remedy = did_you_mean(attribute, names, "name a function of the file")
+    raise InputError(f"it has no {attribute!r}", file=file, remedy=remedy)
 
 
 def words_of(command: str) -> list[str]:

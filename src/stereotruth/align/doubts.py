@@ -9,7 +9,7 @@ RPCs, whose errors have no reason to look like a fault of heights (docs/planted_
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -105,84 +105,55 @@ def _heights_around(stores: Sequence[PointStore], gcp: GcpResidual, reach_m: flo
     return height[distance <= max(reach_m, np.partition(distance, AROUND - 1)[AROUND - 1])]
 
 
-@dataclass(frozen=True)
-class HeightAtGcps:
-    """How the LiDAR lies to ``count`` control points that have points of it around.
-
-    ``agreeing`` of them have one within ``tolerance_m`` of their height; if the LiDAR were
-    ``shift_m`` lower, most would: ``agreeing_shifted``.
-    """
-
-    count: int
-    agreeing: int
-    agreeing_shifted: int
-    shift_m: float
-    tolerance_m: float
-
-    @property
-    def is_off(self) -> bool:
-        """Whether most of the points do not agree; nothing is told of fewer than FEWEST_GCPS."""
-        return self.count >= FEWEST_GCPS and 2 * self.agreeing < self.count
-
-    @property
-    def is_known(self) -> bool:
-        """Whether most would agree if it were lower by the shift."""
-        return 2 * self.agreeing_shifted > self.count
-
-
-def height_at_gcps(
+def off_at_gcps(
     gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float
-) -> HeightAtGcps:
-    """The LiDAR's heights against those of control points.
-
-    A control point on a roof's corner has ground beside it: any of the points around may be the
-    one that it stands for. ``pixel``: size on the ground, m; a measurement is good to a part of it.
-    """
+) -> tuple[list[Floats], float]:
+    """Heights m of the LiDAR's points around each control point less its own; and how far off they
+    may lie by chance. ``pixel``: size on the ground, m; a measurement is good to a part of it."""
     tolerance = FAR_OFF * float(np.hypot(LIDAR_SIGMA_M, CAREFUL_SIGMA[0] * pixel))
     around = [_heights_around(stores, gcp, pixel) - gcp.height for gcp in gcps]
-    around = [differences for differences in around if differences.size]
+    return [differences for differences in around if differences.size], tolerance
 
-    def agreeing(shift: float) -> int:
-        return sum(bool((np.abs(d - shift) <= tolerance).any()) for d in around)
 
-    at = HeightAtGcps(len(around), agreeing(0.0), 0, 0.0, tolerance)
-    if not at.is_off:
-        return at
-    candidates = np.unique(np.round(np.concatenate(around) / tolerance)) * tolerance
-    counts = np.array([agreeing(shift) for shift in candidates])
-    best = int(np.argmax(counts))
-    near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
-    shift = float(np.median([np.median(d) for d in near if d.size]))
-    return replace(at, agreeing_shifted=int(counts[best]), shift_m=shift)
+def agreeing(around: Sequence[Floats], shift: float, tolerance: float) -> int:
+    """How many control points (see :func:`off_at_gcps`) have a point that is off by the shift.
+
+    A control point on a roof's corner has ground beside it: any of the points around may be the
+    one that it stands for.
+    """
+    return sum(bool((np.abs(d - shift) <= tolerance).any()) for d in around)
 
 
 def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float) -> str:
-    """A sentence if most control points lie on no point of the LiDAR, else nothing.
-
-    ``pixel``: see :func:`height_at_gcps`.
-    """
-    at = height_at_gcps(gcps, stores, pixel)
-    if not at.is_off:
+    """A sentence if most control points lie on no point of the LiDAR, else nothing."""
+    around, tolerance = off_at_gcps(gcps, stores, pixel)
+    here = agreeing(around, 0.0, tolerance)
+    if len(around) < FEWEST_GCPS or 2 * here >= len(around):
         return ""
+    candidates = np.unique(np.round(np.concatenate(around) / tolerance)) * tolerance
+    counts = np.array([agreeing(around, shift, tolerance) for shift in candidates])
+    best = int(np.argmax(counts))
+    near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
+    shift = float(np.median([np.median(d) for d in near if d.size]))
     from ..lidar.geoid import fits  # PROJ, which few refinements need
 
     declared = not any(store.has_assumed_heights for store in stores)
     place = [float(np.median([getattr(gcp, name) for gcp in gcps])) for name in ("lon", "lat")]
     cause = (
-        f"{at.agreeing_shifted} would if it were {abs(at.shift_m):.1f} m "
-        f"{'lower' if at.shift_m > 0 else 'higher'}; check the LiDAR's vertical datum and unit "
-        "(geoid, feet), and that the points' heights are ellipsoidal"
-        if at.is_known
+        f"{counts[best]} would if it were {abs(shift):.1f} m "
+        f"{'lower' if shift > 0 else 'higher'}; check the LiDAR's vertical datum and unit (geoid, "
+        "feet), and that the points' heights are ellipsoidal"
+        if 2 * counts[best] > len(around)
         else "at no other height would most of them; check the LiDAR's coordinate system and "
         "height unit"
     )
     text = (
-        f"only {at.agreeing} of {at.count} ground control points have a LiDAR point within "
-        f"{at.tolerance_m:.1f} m of their height: {cause}"
+        f"only {here} of {len(around)} ground control points have a LiDAR point within "
+        f"{tolerance:.1f} m of their height: {cause}"
     )
-    if declared or not at.is_known:
+    if declared or 2 * counts[best] <= len(around):
         return text
-    explained = fits(at.shift_m, *place)
+    explained = fits(shift, *place)
     return f"{text}; {explained}" if explained else text
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..align.alignment import Alignment, GcpResidual
-from ..align.doubts import FEWEST_GCPS, WIDEST_M, control_points_of, height_at_gcps
+from ..align.doubts import FEWEST_GCPS, WIDEST_M, agreeing, control_points_of, off_at_gcps
 from ..core.errors import InputError, in_number, in_words
 from ..core.job import in_own_process
 from ..core.products.remote_files import url_of
@@ -151,13 +151,14 @@ def _off_at_gcps(
         with in_words():
             if sum(survey(path, **how).read[0] for path in ordered) > MOST_POINTS:
                 return ""
-            ask = partial(height_at_gcps, gcps, pixel=pixel)
-            at = in_own_process(partial(_in_stores, ordered, how, ask), ordered[0])
+            ask = partial(off_at_gcps, gcps, pixel=pixel)
+            found, tolerance = in_own_process(partial(_in_stores, ordered, how, ask), ordered[0])
     except InputError:
         return ""
-    off = at.is_off and at.is_known and abs(at.shift_m - 2 * undulation_m) <= at.tolerance_m
-    certain = abs(undulation_m) > CLEAR * at.tolerance_m
-    return f"at {at.agreeing_shifted} of {at.count} GCPs" if off and certain else ""
+    none, once, twice = (agreeing(found, k * undulation_m, tolerance) for k in (0, 1, 2))
+    clear = len(found) >= FEWEST_GCPS and abs(undulation_m) > CLEAR * tolerance
+    certain = clear and 2 * none < len(found) < 2 * twice and once < twice
+    return f"at {twice} of {len(found)} GCPs" if certain else ""
 
 
 def _off_by_rpcs(files: Sequence[SurveyedFile], alignment: Alignment, undulation_m: float) -> str:
