@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from types import FunctionType
 from typing import IO
@@ -105,12 +104,6 @@ def _kept(digest: str) -> Path:
         except OSError:  # another process was first
             shutil.rmtree(scratch)
     return place
-
-
-def is_compiled(module: str) -> bool:
-    """Whether kernels of a module, which is imported for that, are kept: of its present sources."""
-    import_module(module)
-    return any(_kept(sources_digest(module)).rglob("*.nbc"))
 
 
 def source_modules(module: str) -> list[str]:

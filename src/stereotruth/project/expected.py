@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.config.configuration import Configuration
 from ..core.errors import in_number
-from ..core.kernels import is_compiled
+from ..core.kernels import folder, sources_digest
 from ..core.numerics.arrays import Bools
 from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.windows import summed_area, window_sums
@@ -271,7 +272,7 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
     covered = sum(fact.pixels * fact.covered for fact in facts)
     seconds = POINT_S * points + PX_S * pixels + COVERED_PX_S * covered + SCENE_S * len(facts)
     seconds += JOB_S * sum(JOBS + fact.lidar_files for fact in facts)
-    compiling = "" if is_compiled(COMPILED_LAST) else f" + {duration(COMPILE_S)} compiling, once"
+    compiling = "" if is_compiled() else f" + {duration(COMPILE_S)} compiling, once"
     needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels) + RECORDS_BYTES
     free = shutil.disk_usage(Path.cwd()).free
     found.fact(
@@ -302,6 +303,12 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
         )
     else:
         found.fact("memory", f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
+
+
+def is_compiled() -> bool:
+    """Whether the kernels of tiles are kept, of their present sources."""
+    import_module(COMPILED_LAST)
+    return any((folder() / sources_digest(COMPILED_LAST)).rglob("*.nbc"))
 
 
 def locked_folders() -> list[Path]:
