@@ -43,6 +43,7 @@ NAMES = {  # column: what others call it
     },
 }
 
+NO_GEOID = Path("none")  # heights count from the ellipsoid
 NO_SYSTEM = "EPSG:4326"  # of degrees
 SYSTEM = ("crs", "wkt", "epsg", "frame")  # remarks that declare it, the first before others
 
@@ -77,14 +78,12 @@ def import_gcps(
     left: str = "",
     right: str = "",
     epoch: str = "",
-    ellipsoidal: bool = False,
 ) -> list[str]:
     """Write ``to`` from the files of another program; returns what was done, line by line.
 
     Points of a system whose frame is known to centimetres keep it, and ``to`` says it in its first
     lines, as ``epoch`` of the coordinates where it is given (:mod:`..align.control_points`).
-    Heights of rasters and geoids are brought to that frame. ``ellipsoidal``: heights are, if their
-    system does not say what they count from.
+    Heights of rasters and geoids are brought to that frame. ``geoid``: a grid, or NO_GEOID.
 
     Raises InputError that names file and line; nothing is written then.
     """
@@ -105,17 +104,14 @@ def import_gcps(
             remedy="give two .points (left, right), one .gcp, or one .csv",
         )
     crs, epoch, raster = said["crs"], epoch or said["epoch"], heights
+    geoid = geoid or said.get("geoid")
     if heights is not None and heights.suffix.lower() in TABLES:
         placed = to_itrf(points, crs, None, files[0], epoch, places_only=True)
         points, raster = with_heights(points, _in_own_frame(*placed[:2]), heights), None
-    if ellipsoidal and geoid is not None:
-        raise InputError(
-            "both --ellipsoidal and --geoid", file=files[0], remedy="give what the heights are"
-        )
-    ellipsoidal = ellipsoidal or said.get("heights") == "ellipsoidal"
-    points, transform, notes = to_itrf(points, crs, geoid, files[0], epoch, ellipsoidal=ellipsoidal)
+    points, transform, notes = to_itrf(points, crs, geoid, files[0], epoch)
     if raster is not None and (without := [p for p in points if math.isnan(p.height)]):
-        surface = HeightRaster.open(raster, geoid, epochs=EPOCHS, whole=False)
+        grid = None if geoid == NO_GEOID else geoid
+        surface = HeightRaster.open(raster, grid, epochs=EPOCHS, whole=False)
         found = dict(zip((p.id for p in without), surface.heights_at(*_places(without)[:2])))
         points = [replace(p, height=float(found.get(p.id, p.height))) for p in points]
         notes += [f"{raster.name}: {note}" for note in surface.to_wgs84.notes]
@@ -144,16 +140,15 @@ def to_itrf(
     epoch: str = "",
     *,
     places_only: bool = False,
-    ellipsoidal: bool = False,
 ) -> tuple[list[Point], ToWGS84 | None, list[str]]:
     """Points in longitude, latitude and ellipsoidal m, how they got there, and remarks.
 
     In ITRF2020 at EPOCHS where their frame is known to centimetres, else in WGS 84.
 
     ``crs``: EPSG code, compound code or WKT; none: they are degrees. ``epoch`` of the coordinates.
-    ``places_only``: heights are left as they are. ``ellipsoidal``: so they are, if nothing is
-    declared. Raises InputError as for LiDAR (:func:`.to_wgs84.transformation`), and for heights of
-    a national plane system of which nobody says what they count from.
+    ``places_only``: heights are left as they are. Raises InputError as for LiDAR
+    (:func:`.to_wgs84.transformation`), and for heights of a national plane system of which nobody
+    says what they count from.
     """
     if not points:
         return [], None, []
@@ -170,11 +165,11 @@ def to_itrf(
     if places_only or not known.any():  # what heights count from is of no account
         system = replace(system, vertical_datum=None, ellipsoidal=True)
         geoid = None
-    elif not system.has_vertical and geoid is None:
-        if not ellipsoidal and _is_national_plane(system):
-            raise _undecided(points, system, file)
-        if ellipsoidal or not crs:  # as control points of a project have them
-            system = replace(system, ellipsoidal=True)
+    elif geoid == NO_GEOID or not (crs or geoid):  # as control points of a project have them
+        system = system if system.has_vertical else replace(system, ellipsoidal=True)
+        geoid = None
+    elif not (geoid or system.has_vertical) and _is_national_plane(system):
+        raise _undecided(points, system, file)
     ends = np.array([[x.min(), y.min()], [x.max(), y.max()]])
     try:
         epochs = EPOCHS._replace(own=epoch_year(epoch))
@@ -218,7 +213,7 @@ def _undecided(points: Sequence[Point], system: LidarCRS, file: Path) -> InputEr
         file=file,
         remedy="give --geoid GRID if they are"
         + (f" (of the place PROJ knows {named(of_place)})" if of_place else "")
-        + ", or --ellipsoidal if they count from the ellipsoid",
+        + ", or --geoid none if they count from the ellipsoid",
     )
 
 
@@ -454,7 +449,7 @@ def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, str], li
         points.append(Point(cells[called["id"]], *ground, *pixels))
     said = _declared(table, crs)
     if called.get("height") == "ellipsoidal_height":
-        said["heights"] = "ellipsoidal"
+        said["geoid"] = NO_GEOID
     return points, said, [f"{len(points)} points of {file.name}"]
 
 

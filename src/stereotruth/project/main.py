@@ -228,11 +228,9 @@ def gcps_import(
     ] = None,
     crs: Annotated[str, typer.Option(help="CRS of a file that declares none.")] = "",
     geoid: Annotated[
-        Path | None, typer.Option(help="Geoid grid, if the heights are orthometric.")
+        Path | None,
+        typer.Option(help="Geoid grid of orthometric heights; none: they are ellipsoidal."),
     ] = None,
-    ellipsoidal: Annotated[
-        bool, typer.Option("--ellipsoidal", help="The heights count from the ellipsoid.")
-    ] = False,
     left: Annotated[str, typer.Option(help="Name of the left image in a .gcp file.")] = "",
     right: Annotated[str, typer.Option(help="Name of the right image in a .gcp file.")] = "",
     epoch: Annotated[
@@ -244,15 +242,7 @@ def gcps_import(
 
     _print(
         import_gcps(
-            files,
-            to,
-            heights=heights,
-            crs=crs,
-            geoid=geoid,
-            left=left,
-            right=right,
-            epoch=epoch,
-            ellipsoidal=ellipsoidal,
+            files, to, heights=heights, crs=crs, geoid=geoid, left=left, right=right, epoch=epoch
         )
     )
 
