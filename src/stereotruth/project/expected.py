@@ -314,12 +314,10 @@ def is_compiled() -> bool:
 def locked_folders() -> list[Path]:
     """Folders of the products of a run in which nothing can be written: those that are there, with
     the ones in them that products lie in, else the nearest above."""
-    found = set()
-    for top in map(Path, WRITTEN):
-        there = next(place for place in (top, Path(), *Path.cwd().parents) if place.is_dir())
-        inside = [*top.glob("*/"), *top.glob("*/*/")] if top.name in NESTED else []
-        found |= {path for path in (there, *inside) if not os.access(path, os.W_OK | os.X_OK)}
-    return sorted(path for path in found if not path.suffix)
+    found = {top if top.is_dir() else Path() for top in map(Path, WRITTEN)}
+    found |= {path for top in NESTED for end in ("*", "*/*") for path in Path(top).glob(end)}
+    folders = (path for path in found if path.is_dir() and not path.suffix)
+    return sorted(path for path in folders if not os.access(path, os.W_OK | os.X_OK))
 
 
 def _area(m2: float) -> str:

@@ -30,7 +30,7 @@ SAMPLES = 40_000  # labels of a scene at most, evenly thinned: 1.6 MB
 BLOCK_PX = 1024  # a shard of the stores
 SAME_SURFACE_PX = 1.0  # spread of the labels around one: with more, an edge is near
 ON_GRID_PX = 1e-3  # what the inverse of the epipolar model leaves
-STILL_PX, STILL_M = 0.0005, 0.0005  # less is said to be none
+STILL = 0.0005  # px or m: less is said to be none
 COLUMNS = 5  # of a sample
 
 
@@ -79,18 +79,18 @@ class Moves:
         """How far labels have moved, in words, and how many are gone."""
         share = f"{100 * self.gone_share:.1f} %"
         gone = "" if share == "0.0 %" else f"; {share} of them are gone"
-        return _in_words(self.median_px, self.most_px, "px", STILL_PX) + gone
+        return _in_words(self.median_px, self.most_px, "px") + gone
 
     @property
     def heights(self) -> str:
         """How far heights have moved, in words."""
-        return _in_words(self.height_median_m, self.height_most_m, "m", STILL_M)
+        return _in_words(self.height_median_m, self.height_most_m, "m")
 
 
-def _in_words(median: float, most: float, unit: str, still: float) -> str:
+def _in_words(median: float, most: float, unit: str) -> str:
     if math.isnan(most):
         return "are gone"
-    if most < still:
+    if most < STILL:
         return "have not moved"
     return f"moved by {median:.3f} {unit} in the median, {most:.2g} {unit} at most"
 
@@ -106,14 +106,11 @@ def moves(before: Floats, store: str | Path) -> Moves | None:
     moved = np.abs(_between(disparity, x, y) - (x - x_right))
     left = np.isfinite(moved)
     lifted = np.abs(_between(group["height"], x, y) - before[:, 4])[left]
-    count = int(left.sum())
-    figures = _middle_and_most(moved[left]), _middle_and_most(lifted[np.isfinite(lifted)])
-    return Moves(count, *figures[0], 1.0 - count / len(moved), *figures[1])
-
-
-def _middle_and_most(values: Floats) -> tuple[float, float]:
-    """NaN of none."""
-    return (float(np.median(values)), float(values.max())) if values.size else (math.nan, math.nan)
+    figures = [
+        (float(np.median(v)), float(v.max())) if v.size else (math.nan, math.nan)
+        for v in (moved[left], lifted[np.isfinite(lifted)])
+    ]
+    return Moves(int(left.sum()), *figures[0], 1.0 - left.mean(), *figures[1])
 
 
 def _between(disparity: Any, x: Floats, y: Floats) -> Floats:
