@@ -166,6 +166,20 @@ def _geoid(folder: Path) -> None:
     write_sheet(folder, geoid="geoid.gtx")
 
 
+def geoid_of_other_sign(folder: Path, undulation_m: float = 30.0) -> None:
+    """Orthometric points around the control points, and a grid of -N where the geoid has N."""
+    rows = make_gcps()
+    x, y = pyproj.Transformer.from_crs(4326, 32650, always_xy=True).transform(
+        *np.array([(row["lon"], row["lat"]) for row in rows]).T
+    )
+    gcps = np.column_stack([x, y, [row["height"] for row in rows]])
+    around = np.random.default_rng(4).uniform((-4, -4, -0.1), (4, 4, 0.1), (15, 200, 3))
+    xyz = (gcps[:, None] + around).reshape(-1, 3) - (0, 0, undulation_m)
+    write_las(folder / "lidar" / "points.laz", len(xyz), xyz=xyz, system=COMPOUND)
+    write_gtx(folder / "geoid.gtx", np.full((5, 5), -undulation_m), 113.0, 28.0, 1.0)
+    write_sheet(folder, geoid="geoid.gtx")
+
+
 def _without(name: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).unlink()
 
@@ -223,6 +237,8 @@ FAULTS = [
     Fault("orthometric heights", "orthometric", _lidar(system=COMPOUND)),
     Fault("geoid elsewhere", "outside the geoid grid",
           lambda f: (write_lidar(f, system=COMPOUND), _geoid(f))),
+    Fault("geoid of the other sign", "this geoid the LiDAR lies 60.0 m too low, at 15",
+          geoid_of_other_sign),
     Fault("tile too large", "not one tile of",
           lambda f: write_settings(f, tiles={"size": 4096, "min_labelled": 0})),
     Fault("too few points", "min_labelled asks",

@@ -93,3 +93,19 @@ def test_a_wrong_name_ends_before_any_work(project):
         run = project.snakemake("--dry-run", target, "--configfile", "far.yaml")
         *_, heading, message = run.text.rstrip().splitlines()
         assert run.status != 0 and heading == "Refused:" and words in message
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"kind": "function", "function": "own.py:macth"}, "'match'"),
+        ({"kind": "command", "command": "no_such_program {left} {right} {out}"}, "no_such_program"),
+    ],
+)
+def test_a_method_that_is_not_there_ends_before_any_work(project, entry, words):
+    (project.folder / "own.py").write_text("def match(left, right, disparity_range): pass\n")
+    config = {"datasets": {"synthetic": {"methods": ["sgm", "own"]}}, "methods": {"own": entry}}
+    (project.folder / "wrong.yaml").write_text(yaml.safe_dump({"benchmark": config}))
+    run = project.snakemake("--dry-run", "benchmark", "--configfile", "wrong.yaml")
+    *_, heading, message = run.text.rstrip().splitlines()
+    assert run.status != 0 and heading == "Refused:" and words in message

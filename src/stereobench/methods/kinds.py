@@ -13,7 +13,9 @@ from __future__ import annotations
 import ast
 import os
 import os.path
+import re
 import shlex
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
@@ -23,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from stereotruth.core.config.section import PATTERN
-from stereotruth.core.errors import InputError, install_extra
+from stereotruth.core.errors import InputError, did_you_mean, install_extra
 
 IMPORTERS = ("import_module", "__import__", "spec_from_file_location", "run_path", "run_module")
 
@@ -119,8 +121,9 @@ def _results(settings: Mapping[str, Any]) -> list[Path]:
 
 def _code(settings: Mapping[str, Any]) -> list[Path]:
     """The user's file, or all of the module's package, and what they import of the user's."""
-    place = place_of(settings.get("function", ""))[0]
+    place, attribute = place_of(settings.get("function", ""))
     if place.endswith(".py"):
+        _require(attribute, Path(place))
         return imported_files([Path(place)])
     top = place.partition(".")[0]
     try:
@@ -146,6 +149,21 @@ def _code(settings: Mapping[str, Any]) -> list[Path]:
     return imported_files(f.relative_to(here) if f.is_relative_to(here) else f for f in found)
 
 
+def _require(attribute: str, file: Path) -> None:
+    """Raise InputError if a file that is read, and not run, does not even say this name.
+
+    A file that is not there, that takes names of another, or makes some as it runs, may have it.
+    """
+    text = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else "*"
+    if re.search(
+        rf"\b{attribute.partition('.')[0]}\b|\*$|\bglobals\b|\bexec\b", text, re.MULTILINE
+    ):
+        return
+    names = re.findall(r"^(?:async )?(?:def|class) (\w+)", text, re.MULTILINE)
+    remedy = did_you_mean(attribute, names, "name a function of the file")
+    raise InputError(f"it has no {attribute!r}", file=file, remedy=remedy)
+
+
 def words_of(command: str) -> list[str]:
     """The words of a command, as a shell has them.
 
@@ -162,7 +180,12 @@ def words_of(command: str) -> list[str]:
 
 def _program(settings: Mapping[str, Any]) -> list[Path]:
     """The words of the command that are files, and what is named besides."""
-    words = map(Path, words_of(settings.get("command", "")))
+    words = [Path(word) for word in words_of(settings.get("command", ""))]
+    if "{" not in str(words[0]) and shutil.which(words[0]) is None:
+        raise InputError(
+            f"no program {str(words[0])!r} that this machine can run",
+            remedy="install it, or write its path as the first word of command",
+        )
     return sorted({*filter(Path.is_file, words), *map(Path, settings.get("files") or ())})
 
 

@@ -199,6 +199,15 @@ def _score(folder: Path, entry: Entry, tables: Mapping[str, Table]) -> Run:
     program = [place / name for name in entry.files] if entry.program else []
     settings = entry.settings(work / "program")
     predict(dataset, split, entry.name, settings, maps, work=work / "pairs", files=program)
+    if program and not entry.is_random:
+        settings, again = entry.settings(work / "program"), work / "again"
+        how = {"work": again / "pairs", "files": program, "most": 1}
+        predict(dataset, split, entry.name, settings, again / "maps", **how)
+        first = dataset.pairs(split)[0]
+        one, two = (_digest(read_prediction(of, first)) for of in (maps, again / "maps"))
+        if one != two:
+            remedy = 'have it set its seeds, or state "random": true beside its label'
+            entry.refuse(f"two runs of its program differ on pair {first.name}", remedy)
     label = entry.facts["label"]
     summary = score(dataset, split, label, maps, scores, table.plan, products=table.products)
     if program and entry.scores:
@@ -239,6 +248,7 @@ def _ranked(table: Table) -> tuple[list[dict[str, Any]], Differences]:
             "by": by,
             "submissions": [run.entry.name for run in runs],
             "seeds": [run.entry.facts.get("seed") for run in runs],
+            "random": any(run.entry.is_random for run in runs),
             **{key: facts[key] for key in ("licence", "trained_on")},
             **{key: str(facts.get(key) or "") for key in ("paper", "code")},
             "valid_share": min(run.summary["all"]["valid_share"] for run in runs),
@@ -355,7 +365,11 @@ def _ranking(rows: Sequence[Mapping[str, Any]], protocol: Mapping[str, Any]) -> 
             **row,
             "rank": str(row["rank"]),
             "level_with": "\n".join(row["level_with"]) or "–",
-            "seeds": ", ".join(str(seed) for seed in row["seeds"] if seed is not None) or "–",
+            "seeds": ", ".join(
+                [str(seed) for seed in row["seeds"] if seed is not None]
+                + ["random: another run gives other disparities"] * row["random"]
+            )
+            or "–",
         }
         for row in rows
     ]

@@ -69,8 +69,11 @@ def predict(
     files: Sequence[str | Path] = (),
     workers: int = 1,
     code: str = "",
+    most: int | None = None,
 ) -> dict[str, Any]:
     """Match the pairs of a split (None: all), or take a folder's results; returns the record.
+
+    ``most``: so many pairs, the first ones (None: all).
 
     ``settings``: the method's entry of the configuration; ``files``: what else the method is made
     of (weights, the user's code). ``work``: where finished pairs stay.
@@ -78,7 +81,7 @@ def predict(
     Raises InputError if a pair, the method or one of its results cannot be used, or is written
     while it is used.
     """
-    pairs = dataset.pairs(split)
+    pairs = dataset.pairs(split)[:most]
     work = Path(work)
     files = [file for file in files if Path(file).is_file()]
     before = marks(files)

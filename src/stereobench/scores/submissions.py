@@ -75,6 +75,11 @@ class Entry(Submission):
         """Command and lock file; empty of disparities."""
         return self.facts.get("program") or {}
 
+    @property
+    def is_random(self) -> bool:
+        """Whether it states that another run of it gives other disparities."""
+        return bool(self.facts.get("random"))
+
     def settings(self, work: Path) -> dict[str, Any]:
         """The entry of the method that takes its disparities, or runs a copy of its program."""
         if not self.program:

@@ -105,26 +105,33 @@ def _heights_around(stores: Sequence[PointStore], gcp: GcpResidual, reach_m: flo
     return height[distance <= max(reach_m, np.partition(distance, AROUND - 1)[AROUND - 1])]
 
 
-def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float) -> str:
-    """A sentence if most control points lie on no point of the LiDAR, else nothing.
-
-    A control point on a roof's corner has ground beside it: any of the points around may be the
-    one that it stands for. ``pixel``: size on the ground, m; a measurement is good to a part of it.
-    """
+def off_at_gcps(
+    gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float
+) -> tuple[list[Floats], float]:
+    """Heights m of the LiDAR's points around each control point less its own; and how far off they
+    may lie by chance. ``pixel``: size on the ground, m; a measurement is good to a part of it."""
     tolerance = FAR_OFF * float(np.hypot(LIDAR_SIGMA_M, CAREFUL_SIGMA[0] * pixel))
     around = [_heights_around(stores, gcp, pixel) - gcp.height for gcp in gcps]
-    around = [differences for differences in around if differences.size]
-    if len(around) < FEWEST_GCPS:
-        return ""
+    return [differences for differences in around if differences.size], tolerance
 
-    def agreeing(shift: float) -> int:
-        return sum(bool((np.abs(d - shift) <= tolerance).any()) for d in around)
 
-    here = agreeing(0.0)
-    if 2 * here >= len(around):
+def agreeing(around: Sequence[Floats], shift: float, tolerance: float) -> int:
+    """How many control points (see :func:`off_at_gcps`) have a point that is off by the shift.
+
+    A control point on a roof's corner has ground beside it: any of the points around may be the
+    one that it stands for.
+    """
+    return sum(bool((np.abs(d - shift) <= tolerance).any()) for d in around)
+
+
+def doubt_at_gcps(gcps: Sequence[GcpResidual], stores: Sequence[PointStore], pixel: float) -> str:
+    """A sentence if most control points lie on no point of the LiDAR, else nothing."""
+    around, tolerance = off_at_gcps(gcps, stores, pixel)
+    here = agreeing(around, 0.0, tolerance)
+    if len(around) < FEWEST_GCPS or 2 * here >= len(around):
         return ""
     candidates = np.unique(np.round(np.concatenate(around) / tolerance)) * tolerance
-    counts = np.array([agreeing(shift) for shift in candidates])
+    counts = np.array([agreeing(around, shift, tolerance) for shift in candidates])
     best = int(np.argmax(counts))
     near = [d[np.abs(d - candidates[best]) <= tolerance] for d in around]
     shift = float(np.median([np.median(d) for d in near if d.size]))

@@ -1,29 +1,36 @@
-"""The LiDAR of a scene before its run: by its headers, and strips against each other."""
+"""The LiDAR of a scene before its run: its headers, its strips, and the sign of its geoid."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import numpy as np
+
+from ..align.alignment import Alignment, GcpResidual
+from ..align.doubts import FEWEST_GCPS, WIDEST_M, agreeing, control_points_of, off_at_gcps
 from ..core.errors import InputError, in_number, in_words
 from ..core.job import in_own_process
 from ..core.products.remote_files import url_of
 from ..core.sheets import Scene
 from ..core.tables import epoch_year
 from ..lidar.frames import Epoch, Epochs
-from ..lidar.geoid import candidates_at, named
+from ..lidar.geoid import GeoidGrid, candidates_at, named
 from ..lidar.ingest import SurveyedFile, ingest, survey
-from ..lidar.lattice import Footprint
+from ..lidar.lattice import Footprint, apart
 from ..lidar.point_store import PointStore
 from ..lidar.strip_comparison import compare_strips
 from .findings import Findings
 
 MOST_POINTS = 6_000_000  # read and compared in seven seconds
+LEAST_UNDULATION_M = 5.0  # twice of it is more than a storey
+CLEAR = 3.0  # tolerances by which no geoid, the geoid and twice the geoid are told apart
 
 AT_ONCE = 8  # files of servers that are looked at
 NO_DATUM = (
@@ -65,12 +72,106 @@ def _sentence(files: tuple[Path, ...], lidar_crs: str, geoid: str) -> str:
 
 
 def _compared(files: tuple[Path, ...], lidar_crs: str, geoid: str) -> str:
+    how = {"lidar_crs": lidar_crs or None, "geoid": geoid or None}
+    return _in_stores(files, how, lambda stores: compare_strips(stores).sentence)
+
+
+def _in_stores(
+    files: Sequence[Path], how: Mapping[str, Any], ask: Callable[[list[PointStore]], Any]
+) -> Any:
+    """What is asked of the points of files, which are read into stores for that."""
     logging.getLogger("stereotruth").setLevel(logging.ERROR)  # the check says what is odd of files
     with TemporaryDirectory() as folder:
         stores = [Path(folder) / f"{k}_{file.stem}.points" for k, file in enumerate(files)]
         for file, store in zip(files, stores):
-            ingest(file, store, lidar_crs=lidar_crs or None, geoid=geoid or None)
-        return compare_strips([PointStore(store) for store in stores]).sentence
+            ingest(file, store, **how)
+        return ask([PointStore(store) for store in stores])
+
+
+def check_geoid(
+    surveyed: Sequence[SurveyedFile],
+    scene: Scene,
+    alignment: Alignment,
+    pixel: float,
+    found: Findings,
+) -> bool:
+    """Whether heights are off by twice the geoid, H - N in the place of H + N, which is an error.
+
+    Told by the points around control points of the ``alignment``, unless more than MOST_POINTS are
+    to be read for that; without control points by the heights of its RPCs. ``pixel``: size on the
+    ground, m. A geoid of less than LEAST_UNDULATION_M says nothing.
+    """
+    lifted = [f for f in surveyed if f.surface.startswith("orthometric") and f.box and f.heights]
+    if not (scene.geoid and lifted):
+        return False
+    gcps = control_points_of(alignment)
+    lon, lat = np.array([(g.lon, g.lat) for g in gcps] or [alignment.middle[:2]]).T
+    try:
+        undulation_m = float(np.median(GeoidGrid(Path(scene.geoid))(lon, lat)))
+    except InputError:  # said of the files
+        return False
+    if abs(undulation_m) < LEAST_UNDULATION_M:
+        return False
+    if gcps:
+        told = _off_at_gcps(lifted, scene, gcps, pixel, undulation_m)
+    else:
+        told = _off_by_rpcs(lifted, alignment, undulation_m)
+    if told:
+        found.fault(
+            "heights",
+            f"{scene.geoid}: with this geoid the LiDAR lies {2 * abs(undulation_m):.1f} m too "
+            f"{'high' if undulation_m > 0 else 'low'}, {told}: twice its undulation of "
+            f"{undulation_m:+.1f} m, whose sign is wrong",
+            "heights above the ellipsoid are H + N: give a geoid grid whose values here are about "
+            f"{-undulation_m:+.1f} m",
+        )
+    return bool(told)
+
+
+def _off_at_gcps(
+    files: Sequence[SurveyedFile],
+    scene: Scene,
+    gcps: Sequence[GcpResidual],
+    pixel: float,
+    undulation_m: float,
+) -> str:
+    """At which control points the files are off by twice the undulation; empty if they are not."""
+    paths, fitting = set(), 0
+    for gcp in gcps:
+        around = [file for file in files if not apart(file.box, (gcp.lon, gcp.lat) * 2)]
+        lifted = gcp.height + 2 * undulation_m
+        fitting += any(file.heights[0] <= lifted <= file.heights[1] for file in around)
+        paths |= {file.path for file in around}
+    if fitting < FEWEST_GCPS:  # by the headers; so nothing is read where all is well, mostly
+        return ""
+    ordered = sorted(paths)
+    near = Footprint.around([np.array([[g.lon], [g.lat]]) for g in gcps], WIDEST_M)
+    how = {"lidar_crs": scene.lidar_crs or None, "geoid": scene.geoid, "footprint": near}
+    try:
+        with in_words():
+            if sum(survey(path, **how).read[0] for path in ordered) > MOST_POINTS:
+                return ""
+            ask = partial(off_at_gcps, gcps, pixel=pixel)
+            found, tolerance = in_own_process(partial(_in_stores, ordered, how, ask), ordered[0])
+    except InputError:
+        return ""
+    none, once, twice = (agreeing(found, k * undulation_m, tolerance) for k in (0, 1, 2))
+    clear = len(found) >= FEWEST_GCPS and abs(undulation_m) > CLEAR * tolerance
+    certain = clear and 2 * none < len(found) < 2 * twice and once < twice
+    return f"at {twice} of {len(found)} GCPs" if certain else ""
+
+
+def _off_by_rpcs(files: Sequence[SurveyedFile], alignment: Alignment, undulation_m: float) -> str:
+    """Whether the RPCs' heights are those of the files without twice the undulation."""
+    middle = np.median([np.mean(file.heights) for file in files])
+    for sensor in (alignment.left, alignment.right):
+        low, high = sensor.rpc.ground_box[4:]
+        spare = (high - low) / 4
+        if high - low > abs(undulation_m) or low - spare <= middle <= high + spare:
+            return ""
+        if not low <= middle - 2 * undulation_m <= high:
+            return ""
+    return f"by the RPCs' heights of {low:.0f} to {high:.0f} m"
 
 
 def check_lidar(

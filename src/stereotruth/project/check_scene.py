@@ -26,7 +26,7 @@ from ..lidar.frames import DEFAULT_EPOCH, Epoch
 from ..lidar.ingest import SurveyedFile
 from ..lidar.lattice import FAR, Box, Footprint, apart, refuse_apart
 from ..sensor.images import MAX_PIXELS, Source, bands_of
-from .check_lidar import check_lidar, check_strips
+from .check_lidar import check_geoid, check_lidar, check_strips
 from .expected import Nodes, SceneFacts, check_frame, check_labels, pixel_m2
 from .findings import Finding, Findings, Level
 from .project import is_synthetic, lidar_of
@@ -76,9 +76,11 @@ def check_scene(
         surveyed = check_lidar(list(files.values()), scene, found, footprint, epoch)
     check_strips(surveyed, scene, found)
     facts.points, facts.lidar_files = sum(file.read[0] for file in surveyed), len(surveyed)
-    if surveyed and gcps is not None:
+    placed = surveyed and alignment is not None and model is not None
+    off = placed and check_geoid(surveyed, scene, alignment, float(np.sqrt(pixel_m2(model))), found)
+    if surveyed and gcps is not None and not off:
         _hold_against_gcps(surveyed, gcps, found)
-    if surveyed and alignment is not None and model is not None:
+    if placed:
         with found.of("LiDAR"):
             facts.covered = _hold_against_images(surveyed, alignment, model, settings, found)
     return facts

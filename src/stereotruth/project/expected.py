@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..core.config.configuration import Configuration
 from ..core.errors import in_number
+from ..core.kernels import folder, sources_digest
 from ..core.numerics.arrays import Bools
 from ..core.numerics.geometry import DEGREE_M
 from ..core.numerics.windows import summed_area, window_sums
@@ -41,6 +43,9 @@ MEMORY = 4.0e9  # that rules of the way to tiles ask for
 SUPPORT_PX = 2.0  # around a place, of an image that is resampled by cubic convolution
 NODES = 128  # along the longer side of the grid
 SMALL_HOLE_M2, SMALL_HOLE = 10_000, 0.001  # rims that are not worth a line: area, and share
+WRITTEN, NESTED = ("results", "tiles", "logs", ".snakemake"), ("results", "logs")  # by a run
+COMPILED_LAST = "stereotruth.labels.pixel_labels"  # by a run to tiles, of the sources of all others
+COMPILE_S = 70.0  # of the kernels of tiles, on a core (docs/explanation/speed.md)
 BOX_SLACK = 2.0  # how much denser points may be than their header's box says: it may be half empty
 
 
@@ -267,13 +272,20 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
     covered = sum(fact.pixels * fact.covered for fact in facts)
     seconds = POINT_S * points + PX_S * pixels + COVERED_PX_S * covered + SCENE_S * len(facts)
     seconds += JOB_S * sum(JOBS + fact.lidar_files for fact in facts)
+    compiling = "" if is_compiled() else f" + {duration(COMPILE_S)} compiling, once"
     needed = SPARE * (POINT_BYTES * points + PX_BYTES * pixels) + RECORDS_BYTES
     free = shutil.disk_usage(Path.cwd()).free
     found.fact(
         "time",
-        f"about {duration(seconds / max(cores or 1, 1))} on the {cores} cores of this machine, "
-        "from nothing to tiles",
+        f"about {duration(seconds / max(cores or 1, 1))}{compiling} on the {cores} cores of this "
+        "machine, from nothing to tiles",
     )
+    for path in locked_folders():
+        found.fault(
+            "disk",
+            f"{path}: nothing can be written there",
+            "take the write protection off (chmod u+w), or work in a folder of your own",
+        )
     if needed > free:
         found.fault(
             "disk",
@@ -291,6 +303,21 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
         )
     else:
         found.fact("memory", f"up to {_gb(MEMORY)} a job, of {_gb(memory)}")
+
+
+def is_compiled() -> bool:
+    """Whether the kernels of tiles are kept, of their present sources."""
+    import_module(COMPILED_LAST)
+    return any((folder() / sources_digest(COMPILED_LAST)).rglob("*.nbc"))
+
+
+def locked_folders() -> list[Path]:
+    """Folders of the products of a run in which nothing can be written: those that are there, with
+    the ones in them that products lie in, else the nearest above."""
+    found = {top if top.is_dir() else Path() for top in map(Path, WRITTEN)}
+    found |= {path for top in NESTED for end in ("*", "*/*") for path in Path(top).glob(end)}
+    folders = (path for path in found if path.is_dir() and not path.suffix)
+    return sorted(path for path in folders if not os.access(path, os.W_OK | os.X_OK))
 
 
 def _area(m2: float) -> str:

@@ -20,8 +20,9 @@ from ..core.errors import InputError
 from ..core.numerics.geometry import metres_per_degree, turn
 from ..core.products.files import as_text
 from ..core.tables import Lines, Table, epoch_year
-from ..lidar.declared_crs import parse_crs
-from ..lidar.frames import WGS84_NAME, Epoch, Epochs
+from ..lidar.declared_crs import LidarCRS, degrees_of, parse_crs, unbound
+from ..lidar.frames import WGS84_ENSEMBLE, WGS84_NAME, Epoch, Epochs, datum_code
+from ..lidar.geoid import candidates_at, named
 from ..lidar.height_raster import Floats, HeightRaster
 from ..lidar.to_wgs84 import ToWGS84, check_area, transformation
 
@@ -42,6 +43,7 @@ NAMES = {  # column: what others call it
     },
 }
 
+NO_GEOID = Path("none")  # heights count from the ellipsoid
 NO_SYSTEM = "EPSG:4326"  # of degrees
 SYSTEM = ("crs", "wkt", "epsg", "frame")  # remarks that declare it, the first before others
 
@@ -81,7 +83,7 @@ def import_gcps(
 
     Points of a system whose frame is known to centimetres keep it, and ``to`` says it in its first
     lines, as ``epoch`` of the coordinates where it is given (:mod:`..align.control_points`).
-    Heights of rasters and geoids are brought to that frame.
+    Heights of rasters and geoids are brought to that frame. ``geoid``: a grid, or NO_GEOID.
 
     Raises InputError that names file and line; nothing is written then.
     """
@@ -102,12 +104,14 @@ def import_gcps(
             remedy="give two .points (left, right), one .gcp, or one .csv",
         )
     crs, epoch, raster = said["crs"], epoch or said["epoch"], heights
+    geoid = geoid or said.get("geoid")
     if heights is not None and heights.suffix.lower() in TABLES:
         placed = to_itrf(points, crs, None, files[0], epoch, places_only=True)
         points, raster = with_heights(points, _in_own_frame(*placed[:2]), heights), None
     points, transform, notes = to_itrf(points, crs, geoid, files[0], epoch)
     if raster is not None and (without := [p for p in points if math.isnan(p.height)]):
-        surface = HeightRaster.open(raster, geoid, epochs=EPOCHS, whole=False)
+        grid = None if geoid == NO_GEOID else geoid
+        surface = HeightRaster.open(raster, grid, epochs=EPOCHS, whole=False)
         found = dict(zip((p.id for p in without), surface.heights_at(*_places(without)[:2])))
         points = [replace(p, height=float(found.get(p.id, p.height))) for p in points]
         notes += [f"{raster.name}: {note}" for note in surface.to_wgs84.notes]
@@ -142,8 +146,9 @@ def to_itrf(
     In ITRF2020 at EPOCHS where their frame is known to centimetres, else in WGS 84.
 
     ``crs``: EPSG code, compound code or WKT; none: they are degrees. ``epoch`` of the coordinates.
-    ``places_only``: heights are left as they are. Raises InputError as for LiDAR: see
-    :func:`.to_wgs84.transformation`.
+    ``places_only``: heights are left as they are. Raises InputError as for LiDAR
+    (:func:`.to_wgs84.transformation`), and for heights of a national plane system of which nobody
+    says what they count from.
     """
     if not points:
         return [], None, []
@@ -160,8 +165,11 @@ def to_itrf(
     if places_only or not known.any():  # what heights count from is of no account
         system = replace(system, vertical_datum=None, ellipsoidal=True)
         geoid = None
-    elif not crs and geoid is None:  # as control points of a project have them
-        system = replace(system, ellipsoidal=True)
+    elif geoid == NO_GEOID or not (crs or geoid):  # as control points of a project have them
+        system = system if system.has_vertical else replace(system, ellipsoidal=True)
+        geoid = None
+    elif not (geoid or system.has_vertical) and _is_national_plane(system):
+        raise _undecided(points, system, file)
     ends = np.array([[x.min(), y.min()], [x.max(), y.max()]])
     try:
         epochs = EPOCHS._replace(own=epoch_year(epoch))
@@ -186,6 +194,27 @@ def to_itrf(
         notes.append(f"heights brought to the ellipsoid by {geoid.name}")
     height = height if places_only else np.where(known, lifted, np.nan)
     return _placed(points, lon, lat, height), transform, [note for note in notes if note]
+
+
+def _is_national_plane(system: LidarCRS) -> bool:
+    """Whether it is projected, and of another datum than WGS 84: of a survey, with its heights."""
+    horizontal = unbound(system.horizontal)
+    return horizontal.is_projected and datum_code(horizontal.geodetic_crs) != WGS84_ENSEMBLE
+
+
+def _undecided(points: Sequence[Point], system: LidarCRS, file: Path) -> InputError:
+    """A refusal with the geoids that there are of the place."""
+    x, y, _ = _places(points)
+    place = degrees_of(system.horizontal, x.mean(), y.mean())
+    of_place = candidates_at(*map(float, place)) if place else []
+    return InputError(
+        f"heights of '{system.name}': nothing says what they count from, and heights of national "
+        "plane systems are orthometric as a rule",
+        file=file,
+        remedy="give --geoid GRID if they are"
+        + (f" (of the place PROJ knows {named(of_place)})" if of_place else "")
+        + ", or --geoid none if they count from the ellipsoid",
+    )
 
 
 def _places(points: Sequence[Point]) -> Floats:
@@ -418,7 +447,10 @@ def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, str], li
         pixels = ((value[f"{v}_col"], value[f"{v}_row"]) for v in ("left", "right"))
         ground = value["lon"], value["lat"], value.get("height", math.nan)
         points.append(Point(cells[called["id"]], *ground, *pixels))
-    return points, _declared(table, crs), [f"{len(points)} points of {file.name}"]
+    said = _declared(table, crs)
+    if called.get("height") == "ellipsoidal_height":
+        said["geoid"] = NO_GEOID
+    return points, said, [f"{len(points)} points of {file.name}"]
 
 
 def with_heights(points: Sequence[Point], ground: Sequence[Point], source: Path) -> list[Point]:

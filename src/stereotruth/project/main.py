@@ -231,7 +231,8 @@ def gcps_import(
     ] = None,
     crs: Annotated[str, typer.Option(help="CRS of a file that declares none.")] = "",
     geoid: Annotated[
-        Path | None, typer.Option(help="Geoid grid, if the heights are orthometric.")
+        Path | None,
+        typer.Option(help="Geoid grid of orthometric heights; none: they are ellipsoidal."),
     ] = None,
     left: Annotated[str, typer.Option(help="Name of the left image in a .gcp file.")] = "",
     right: Annotated[str, typer.Option(help="Name of the right image in a .gcp file.")] = "",

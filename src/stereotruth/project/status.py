@@ -18,25 +18,29 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.products.files import read_json
+from ..core.sheets import Scene
 from ..evaluate.report.index_page import PAGES
 from ..tiles.label_moves import moves, sample_labels, worst_point
 from ..tiles.manifest import read_manifest
 from .check import chosen
 from .findings import heard, plain_table, wide
-from .project import configured, read_scenes, require_scenes, sheet
+from .project import configured, read_images, read_scenes, require_scenes, sheet
 from .run_workflow import arguments_for
 
 FOLLOWS = "Input files updated by another job"  # of a job that runs because another does
 LONGEST = 300  # characters of a reason
 MISSING = "Missing output files"  # of what was never made
-# Rules of figures and pages, which tiles are up to date without.
+# Rules of figures, pages and what else is made of labels, which tiles are up to date without.
 AFTER_TILES = {
-    "draw_residuals", "draw_refinement", "evaluate_images", "evaluate_truth",
-    "evaluate_truth_city", "grid_truth", "report_city", "simulate_truth",
+    "closure_of_site", "draw_residuals", "draw_refinement", "dsm", "evaluate_images",
+    "evaluate_truth", "evaluate_truth_city", "grid_truth", "image_heights", "originals",
+    "predict_scene", "report_city", "score_dsm", "simulate_truth",
 }  # fmt: skip
-TO_DO = "a run of tiles, evaluate and report would do, and why"
+TO_DO = "a run of what is here would do, and why"
+OF_ALL = "all cities"  # in the place of a city
 # How Snakemake says that params differ, and what stands in these; ``code``, and what stands in
 # ``sources``, are digests (workflow/rules/sources.smk).
 PARAMS = re.compile(r"Params have changed .*?before: (.*) now: (.*)")
@@ -86,7 +90,8 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
     for record in records:
         if str(getattr(record, "event", "")).endswith("job_info"):
             wildcards = dict(record.wildcards or {})
-            of = "/".join(wildcards.get(name, "") for name in ("scene", "lidar", "tile")).strip("/")
+            names = ("scene", "lidar", "tile", "image", "dataset", "method")
+            of = "/".join(filter(None, map(wildcards.get, names)))
             city = wildcards.get("city", "")
             jobs.append(PlannedJob(record.rule_name, city, of, record.reason))
     return jobs
@@ -94,7 +99,10 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
 
 @dataclass(frozen=True)
 class CityStatus:
-    """A city's tiles and pages, and what a run of tiles, `evaluate` and `report` would do."""
+    """A city's tiles and pages, or what is made of all cities together, and what a run would do.
+
+    Of tiles, pages and the figures of `evaluate`, and of all else that was ever made.
+    """
 
     city: str
     made: str
@@ -177,8 +185,33 @@ def _made(city: str) -> str:
     return f"{len(rows)} tiles ({', '.join(counts)})"
 
 
+def _made_before(
+    settings: Configuration, cities: Sequence[str], scenes: Mapping[str, Scene]
+) -> tuple[list[str], list[str]]:
+    """Targets beside tiles and pages that are here: of cities, and of all cities together.
+
+    Those of cities, scenes, images, methods and datasets that are no more cannot be made again.
+    """
+    methods = [name for name, entry in settings.benchmark.methods.items() if entry]
+    datasets = [name for name, entry in settings.benchmark.datasets.items() if entry]
+    images = read_images(settings, cities).values()
+    of_scenes = [f"{s.city}/{s.scene}/{method}" for s in scenes.values() for method in methods]
+    of_cities = [
+        *(f"originals/{city}" for city in cities),
+        *(f"results/closure/{city}.json" for city in cities),
+        *(f"results/heights/{image.city}/{image.image}.zarr" for image in images),
+        *(f"results/predict/{name}_dsm.tif" for name in of_scenes),
+        *(f"score_dsm/{name}" for name in of_scenes),
+    ]
+    of_all = ["dataset", *(f"benchmark/{name}/index.html" for name in datasets)]
+    of_all += [f"benchmark/{name}/{method}" for name in datasets for method in methods]
+    of_all += [f"audit/{name}" for name in datasets]
+    return tuple([name for name in names if Path(name).exists()] for names in (of_cities, of_all))
+
+
 def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list[CityStatus]:
-    """The status of cities, or of those of scenes; all of the sheet if none is named.
+    """The status of cities, or of those of scenes; all of the sheet if none is named, and then of
+    what is made of all of them together.
 
     Raises InputError for a name that no sheet has.
     """
@@ -189,9 +222,11 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
     wanted = [city for city in known if any(scene.city == city for scene in found.values())]
     of_city = "tiles/{0}", "results/report/{0}/index.html"
     targets = [target.format(city) for city in wanted for target in of_city]
-    jobs = plan([*targets, "evaluate"], configfiles)
+    of_cities, of_all = _made_before(settings, known, found)
+    of_all = [] if cities else of_all
+    jobs = plan([*targets, *of_cities, *of_all, "evaluate"], configfiles)
     pages = [page for pattern in PAGES for page in Path().glob(pattern)]
-    return [
+    every = [
         CityStatus(
             city,
             _made(city),
@@ -200,6 +235,10 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
         )
         for city in wanted
     ]
+    if of_all:
+        together = tuple(job for job in jobs if not job.city and job.rule != "evaluate")
+        every.append(CityStatus(OF_ALL, ", ".join(of_all), (), together))
+    return every
 
 
 def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> None:
@@ -215,9 +254,12 @@ def show_status(cities: Sequence[str], configfiles: Sequence[Path] | None) -> No
 
 
 def compare_labels(old: Path, new: Path) -> Table:
-    """A table of the scenes of two folders `results`: how far labels have moved from the ``old`` to
-    the ``new``, and the control points of both. Raises InputError if they share no scene."""
-    headings = ("scene", "labels, px of disparity", "control points, px rms", "worst")
+    """A table of the scenes of two folders `results`: how far labels and heights have moved from
+    the ``old`` to the ``new``, and the control points of both.
+
+    Raises InputError if they share no scene.
+    """
+    headings = ("scene", "labels, px of disparity", "height, m", "control points, px rms", "worst")
     table = plain_table(headings, whole=("scene",))
     for store in sorted(new.glob("project/*/*.zarr")):
         if (before := old / store.relative_to(new)).is_dir():
@@ -225,7 +267,8 @@ def compare_labels(old: Path, new: Path) -> Table:
             name = f"{store.parent.name}/{store.stem}"
             records = [_alignment(results, name) for results in (old, new)]
             rms = " -> ".join(map(_rms, records))
-            cells = name, str(found or "none before"), rms, worst_point(records[1])[1]
+            moved = (found.disparities, found.heights) if found else ("none before", "")
+            cells = name, *moved, rms, worst_point(records[1])[1]
             table.add_row(*map(escape, cells))
     if not table.row_count:
         raise InputError(

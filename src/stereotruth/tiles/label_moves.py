@@ -2,7 +2,9 @@
 
 A label joins a place of the left original image to one of the right. No edit of points, settings or
 images' corrections moves these, while the epipolar grid follows the alignment: so labels of two
-runs are compared at the same places of the left image, by where each has the right one.
+runs are compared at the same places of the left image, by where each has the right one. Heights
+there are compared as well: without control points the images follow the LiDAR, so that a fault of
+all its heights hardly moves a disparity.
 
 Of each scene a thinned sample of its labels is kept in KEPT, outside the products, until the next
 tiles are made. It is replaced last, so that a killed job is compared with the same labels again.
@@ -24,20 +26,22 @@ from ..core.products.grids import blocks, require_complete
 from ..epipolar.model import EpipolarModel
 
 KEPT = Path(".snakemake", "stereotruth", "labels")
-SAMPLES = 40_000  # labels of a scene at most, evenly thinned: 1.3 MB
+SAMPLES = 40_000  # labels of a scene at most, evenly thinned: 1.6 MB
 BLOCK_PX = 1024  # a shard of the stores
 SAME_SURFACE_PX = 1.0  # spread of the labels around one: with more, an edge is near
 ON_GRID_PX = 1e-3  # what the inverse of the epipolar model leaves
-STILL_PX = 0.0005  # less is said to be none
+STILL = 0.0005  # px or m: less is said to be none
+COLUMNS = 5  # of a sample
 
 
 def sample_labels(store: str | Path) -> Floats:
-    """[n, (left col, row, right col, row)] px of the original images, of labels of a disparity
-    store whose eight neighbours have labels of the same surface. Raises InputError."""
+    """[n, (left col, row, right col, row, height)] px of the original images and m, of labels of a
+    disparity store whose eight neighbours have labels of the same surface. Raises InputError."""
     group = require_complete(store)
-    disparity, model = group["disparity"], EpipolarModel.from_dict(group.attrs["epipolar"])
+    disparity, heights = group["disparity"], group["height"]
+    model = EpipolarModel.from_dict(group.attrs["epipolar"])
     step = max(1, math.ceil(math.sqrt(math.prod(disparity.shape) / SAMPLES)))
-    found = [np.empty((0, 4))]
+    found = [np.empty((0, COLUMNS))]
     for rows, cols in blocks(disparity.shape, BLOCK_PX):
         values = np.asarray(disparity[rows, cols])
         r, c = (np.arange(1, n - 1, step) for n in values.shape)
@@ -46,30 +50,49 @@ def sample_labels(store: str | Path) -> Floats:
         d = around[4][smooth].astype(float)
         y, x = (np.add.outer(r, 0 * c)[smooth] + rows.start, np.add.outer(0 * r, c)[smooth])
         x = x + cols.start
+        height = np.asarray(heights[rows, cols])[np.ix_(r, c)][smooth].astype(float)
         places = *model.epipolar_to_left(x, y), *model.epipolar_to_right(x - d, y)
-        found.append(np.column_stack(places))
+        found.append(np.column_stack([*places, height]))
     return np.concatenate(found)
 
 
 @dataclass(frozen=True)
 class Moves:
     """How far ``count`` labels have moved, px of disparity: ``median_px``, ``most_px``; NaN if none
-    is left. ``gone_share``: of the labels before, those that are no more."""
+    is left. ``gone_share``: of the labels before, those that are no more. ``height_median_m``,
+    ``height_most_m``: how far heights have moved at labels that are left."""
 
     count: int
     median_px: float
     most_px: float
     gone_share: float
+    height_median_m: float
+    height_most_m: float
 
     def __str__(self) -> str:
-        share = f"{100 * self.gone_share:.1f} %"
-        gone = "" if share == "0.0 %" else f"; {share} of them are gone"
         if not self.count:
             return "has none of its labels left"
-        if self.most_px < STILL_PX:
-            return f"labels have not moved{gone}"
-        most = f"{self.most_px:.2g} px at most"
-        return f"labels moved by {self.median_px:.3f} px in the median, {most}{gone}"
+        return f"labels {self.disparities}; heights {self.heights}"
+
+    @property
+    def disparities(self) -> str:
+        """How far labels have moved, in words, and how many are gone."""
+        share = f"{100 * self.gone_share:.1f} %"
+        gone = "" if share == "0.0 %" else f"; {share} of them are gone"
+        return _in_words(self.median_px, self.most_px, "px") + gone
+
+    @property
+    def heights(self) -> str:
+        """How far heights have moved, in words."""
+        return _in_words(self.height_median_m, self.height_most_m, "m")
+
+
+def _in_words(median: float, most: float, unit: str) -> str:
+    if math.isnan(most):
+        return "are gone"
+    if most < STILL:
+        return "have not moved"
+    return f"moved by {median:.3f} {unit} in the median, {most:.2g} {unit} at most"
 
 
 def moves(before: Floats, store: str | Path) -> Moves | None:
@@ -79,11 +102,15 @@ def moves(before: Floats, store: str | Path) -> Moves | None:
     group = require_complete(store)
     disparity, model = group["disparity"], EpipolarModel.from_dict(group.attrs["epipolar"])
     x, y = model.left_to_epipolar(*before[:, :2].T)
-    x_right, _ = model.right_to_epipolar(*before[:, 2:].T)
+    x_right, _ = model.right_to_epipolar(*before[:, 2:4].T)
     moved = np.abs(_between(disparity, x, y) - (x - x_right))
-    left = moved[np.isfinite(moved)]
-    figures = (float(np.median(left)), float(left.max())) if left.size else (math.nan, math.nan)
-    return Moves(left.size, *figures, 1.0 - left.size / len(moved))
+    left = np.isfinite(moved)
+    lifted = np.abs(_between(group["height"], x, y) - before[:, 4])[left]
+    figures = [
+        (float(np.median(v)), float(v.max())) if v.size else (math.nan, math.nan)
+        for v in (moved[left], lifted[np.isfinite(lifted)])
+    ]
+    return Moves(int(left.sum()), *figures[0], 1.0 - left.mean(), *figures[1])
 
 
 def _between(disparity: Any, x: Floats, y: Floats) -> Floats:
@@ -103,14 +130,14 @@ def _between(disparity: Any, x: Floats, y: Floats) -> Floats:
 
 def since_last_run(stores: Mapping[str, str | Path]) -> dict[str, Moves]:
     """By scene, of disparity stores: how far labels have moved since samples were kept, where some
-    were. A sample that cannot be read counts as none."""
+    were. A sample that cannot be read, or is of another form, counts as none."""
     found = {}
     for scene, store in stores.items():
         try:
             before = np.load(KEPT / f"{scene}.npy")
         except (OSError, ValueError):
             continue
-        if (moved := moves(before, store)) is not None:
+        if before.shape[1:] == (COLUMNS,) and (moved := moves(before, store)) is not None:
             found[scene] = moved
     return found
 

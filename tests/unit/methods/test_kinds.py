@@ -42,13 +42,13 @@ def files(function: str) -> set[str]:
     ],
 )
 def test_all_forms_of_an_import_are_followed(here, text, expected):
-    Path("code/mine.py").write_text(text)
+    Path("code/mine.py").write_text(f"{text}\nmatch = None")
     found = {str(Path(f).absolute().relative_to(here)) for f in files("code/mine.py:match")}
     assert found == {"code/mine.py", *expected}
 
 
 def test_files_of_functions_commands_and_entry_points(monkeypatch):
-    Path("mine.py").write_text("import helper")
+    Path("mine.py").write_text("import helper as match")
     Path("helper.py").write_text("import mine, pack.deep")
     assert files("mine.py:match") == {"mine.py", "helper.py", *PACK}
     assert files("pack.deep:match") == files("pack:match") == PACK
@@ -62,6 +62,31 @@ def test_files_of_functions_commands_and_entry_points(monkeypatch):
     for wrong in ("no_such_module:f", "sys:exit", "others"):
         with pytest.raises(InputError):
             files(wrong)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "class match: pass",
+        "if True:\n    async def match(): pass",
+        "a, match = 0, 1",
+        "from pack import other as match",
+        "from pack import *",
+        "globals()['mat' + 'ch'] = 0",
+    ],
+)
+def test_a_function_that_may_be_there_is_not_refused(text):
+    Path("mine.py").write_text(text)
+    files("mine.py:match")
+
+
+def test_a_function_or_program_that_is_not_there_is_refused():
+    Path("mine.py").write_text("def matching(): pass")
+    with pytest.raises(InputError) as refused:
+        files("mine.py:match")
+    assert "matching" in refused.value.remedy
+    with pytest.raises(InputError):
+        KINDS["command"].files({"command": "no_such_program {left} {right} {out}"})
 
 
 def test_files_are_named_below_the_folder_that_they_share(here):

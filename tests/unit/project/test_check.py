@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rasterio
 from rich.console import Console
@@ -13,7 +15,17 @@ from stereotruth.project import check
 from stereotruth.project.check import check_project
 from stereotruth.project.findings import Level, show
 
-from ...synthetic.broken_scenes import DOUBTS, FAULTS, Fault, write_settings
+from ...synthetic.broken_scenes import (
+    DOUBTS,
+    FAULTS,
+    Fault,
+    geoid_of_other_sign,
+    write_settings,
+    write_sheet,
+)
+from ...synthetic.las import write_gtx
+from ...synthetic.rpc_texts import rpb_text
+from ...synthetic.surveyed_pair import RPCS
 
 
 def texts(level: Level) -> list[str]:
@@ -53,6 +65,31 @@ def test_what_a_run_gets_through_is_a_doubt(folder, fault: Fault):
     if fault is DOUBTS[-1]:
         write_settings(folder, strict=True)
         assert any("left out" in text for text in texts(Level.ERROR))
+
+
+@pytest.mark.parametrize("undulation_m", [-3.0, 30.0])
+def test_a_geoid_that_is_small_or_right_is_no_error(folder, undulation_m):
+    geoid_of_other_sign(folder, undulation_m)
+    if undulation_m > 5.0:
+        write_gtx(folder / "geoid.gtx", np.full((5, 5), undulation_m), 113.0, 28.0, 1.0)
+    assert texts(Level.ERROR) == []
+
+
+def test_without_control_points_the_rpcs_tell_a_geoid_of_the_other_sign(folder):
+    geoid_of_other_sign(folder, 100.0)
+    assert not any("with this geoid" in text for text in _without_gcps(height_scale=500.0))
+    assert any("RPCs' heights of 15 to 105 m" in text for text in _without_gcps(height_scale=45.0))
+
+
+def _without_gcps(height_scale: float) -> list[str]:
+    for view in ("left", "right"):
+        rpc = RPCS[view]
+        line = rpc.line_num_coeff.copy()
+        line[3] *= height_scale / rpc.height_scale
+        rpc = replace(rpc, height_scale=height_scale, line_num_coeff=line)
+        Path(f"{view}.rpb").write_text(rpb_text(rpc.to_dict()))
+    write_sheet(Path(), geoid="geoid.gtx", gcps="")
+    return texts(Level.ERROR)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from pathlib import Path
 
 import numpy as np
 import pyproj
@@ -131,6 +132,9 @@ def test_tables_with_other_names(rows, truth, tmp_path):
     (tmp_path / "a.csv").write_text("\n".join(lines))
     import_gcps([tmp_path / "a.csv"], tmp_path / "out.csv", crs="EPSG:32650")
     agree(tmp_path / "out.csv", truth)
+    esri = pyproj.CRS("EPSG:32650").to_wkt("WKT1_ESRI")  # which is no national system either
+    import_gcps([tmp_path / "a.csv"], tmp_path / "esri.csv", crs=esri)
+    agree(tmp_path / "esri.csv", truth)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +158,8 @@ def test_points_keep_a_frame_that_is_known(tmp_path):
     (tmp_path / "a.csv").write_text(
         "id,x,y,height,left_col,left_row,right_col,right_row\nA,550000,5272000,20,1,2,3,4\n"
     )
-    import_gcps([tmp_path / "a.csv"], tmp_path / "out.csv", crs="EPSG:6339", epoch="2010.0")
+    import_gcps([tmp_path / "a.csv"], tmp_path / "out.csv", crs="EPSG:6339", epoch="2010.0",
+                geoid=Path("none"))  # fmt: skip
     lines = (tmp_path / "out.csv").read_text().splitlines()
     assert lines[:2] == ["# frame: EPSG:6318", "# epoch: 2010.0"]
     found = read_gcps(tmp_path / "out.csv")
@@ -164,10 +169,44 @@ def test_points_keep_a_frame_that_is_known(tmp_path):
     place = lines[3].split(",")
     (tmp_path / "h.csv").write_text(f"lon;lat;height\n{place[1]};{place[2]};20,0\n")
     import_gcps([tmp_path / "b.csv"], tmp_path / "out_b.csv", crs="EPSG:6339",
-                heights=tmp_path / "h.csv")  # fmt: skip
+                heights=tmp_path / "h.csv", geoid=Path("none"))  # fmt: skip
     assert read_gcps(tmp_path / "out_b.csv").height[0] == found.height[0]
     import_gcps([tmp_path / "a.csv"], tmp_path / "wgs.csv", crs="EPSG:32610")
     assert not (tmp_path / "wgs.csv").read_text().startswith("#")
+
+
+def paris(tmp_path, height="height"):
+    file = tmp_path / "a.csv"
+    file.write_text(HEAD.replace("height", height) + "A,652000,6862000,35,1,2,3,4\n")
+    return file
+
+
+def test_heights_of_a_national_plane_system_are_asked_for(tmp_path):
+    """Of Lambert 93 without a vertical part: IGN 69, 44 m below the ellipsoid, or not."""
+    file, out = paris(tmp_path), tmp_path / "out.csv"
+    with pytest.raises(InputError) as refused:
+        import_gcps([file], out, crs="EPSG:2154")
+    assert "--geoid" in refused.value.remedy and "--geoid none" in refused.value.remedy
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("crs", "column", "how", "lifted"),
+    [
+        ("EPSG:2154", "height", {"geoid": "geoid.gtx"}, 44.0),
+        ("EPSG:2154+5720", "height", {"geoid": "geoid.gtx"}, 44.0),
+        ("EPSG:2154", "height", {"geoid": "none"}, 0.0),
+        ("EPSG:2154", "ellipsoidal_height", {}, 0.0),
+        (pyproj.CRS("EPSG:2154").to_3d().to_wkt(), "height", {}, 0.0),
+    ],
+)
+def test_stated_heights_of_a_national_plane_system(tmp_path, crs, column, how, lifted):
+    file, out = paris(tmp_path, column), tmp_path / "out.csv"
+    write_gtx(tmp_path / "geoid.gtx", np.full((9, 9), 44.0), 0.0, 46.0, 1.0)
+    how = {k: Path(v) if v == "none" else tmp_path / v for k, v in how.items()}
+    import_gcps([file], out, crs=crs, **how)
+    height = float(out.read_text().splitlines()[-1].split(",")[3])
+    assert height == pytest.approx(35.0 + lifted, abs=1e-3)
 
 
 SEATTLE = (-122.3, 47.6)

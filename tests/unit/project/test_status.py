@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from stereotruth.project.status import CityStatus, PlannedJob
+from pathlib import Path
+
+from stereotruth.project import status
+from stereotruth.project.status import CityStatus, PlannedJob, status_of
 
 SAYS = "Params have changed since last execution:"
 UNION = f"{SAYS} Union of exclusive params before and now across all output:"
@@ -20,9 +23,9 @@ JOBS = (
 
 
 def test_causes_are_said_once_and_what_follows_from_them_not_at_all():
-    status = CityStatus("A", "4 tiles (4 train)", (), JOBS)
-    assert status.state == "out of date"
-    assert status.why() == [
+    city = CityStatus("A", "4 tiles (4 train)", (), JOBS)
+    assert city.state == "out of date"
+    assert city.why() == [
         "align 3, refine 1, project 1",
         "align A-1, align A-2 and 1 more: changed: size 128 -> 96",
         "refine A-1: changed: 0 -> 1, code, gcps",
@@ -32,9 +35,9 @@ def test_causes_are_said_once_and_what_follows_from_them_not_at_all():
 def test_figures_and_pages_are_listed_and_leave_tiles_up_to_date():
     page = PlannedJob("report_city", "A", "", "Missing output files: results/report/A/index.html")
     truth = PlannedJob("evaluate_truth", "A", "A-1", DIGESTS)
-    status = CityStatus("A", "4 tiles", (), (page, truth))
-    assert status.state == "up to date"
-    assert status.why()[0] == "evaluate_truth 1"  # the page was never made: nothing is due
+    city = CityStatus("A", "4 tiles", (), (page, truth))
+    assert city.state == "up to date"
+    assert city.why()[0] == "evaluate_truth 1"  # the page was never made: nothing is due
     assert CityStatus("A", "4 tiles", (), (page, *JOBS)).why()[0] == (
         "align 3, refine 1, project 1, report_city 1"
     )
@@ -47,3 +50,23 @@ def test_what_was_never_made_needs_no_cause():
     assert CityStatus("A", "4 tiles", (), (job,)).why()[1].startswith("align A-1: Missing")
     assert CityStatus("A", "4 tiles", (), ()).state == "up to date"
     assert CityStatus("A", "4 tiles", (), ()).why() == []
+
+
+def test_what_was_ever_made_is_planned_and_what_is_no_more_is_not(folder, monkeypatch):
+    """What is made of one city has its row; what of all, a row of its own."""
+    made = ["originals/Good", "dataset", "benchmark/synthetic/sgm", "score_dsm/Good/Good-1/sgm"]
+    for path in [*made, "originals/Gone", "score_dsm/Good/Good-1/gone"]:
+        Path(path).mkdir(parents=True)
+    jobs = [
+        PlannedJob("originals", "Good", "", PARAMS),
+        PlannedJob("score", "", "synthetic/sgm", PARAMS),
+        PlannedJob("evaluate", "", "", "Rules with neither input nor output files"),
+    ]
+    asked = []
+    monkeypatch.setattr(status, "plan", lambda targets, files: asked.extend(targets) or jobs)
+    good, together = status_of([], [Path("config.yaml")])
+    page = "results/report/Good/index.html"
+    assert sorted(asked) == sorted(["tiles/Good", page, "evaluate", *made])
+    assert good.why()[0] == "originals 1" and together.why()[0] == "score 1"
+    asked.clear()
+    assert len(status_of(["Good"], [Path("config.yaml")])) == 1 and "dataset" not in asked

@@ -188,6 +188,29 @@ def test_runs_of_a_method_are_one_row_and_a_program_is_run(made, tmp_path):
     assert line.startswith(f"program/{FILE}: ")
 
 
+def test_a_program_whose_runs_differ_is_refused_unless_it_states_so(made, tmp_path):
+    top = copied(made, tmp_path)
+    program = top / "submissions/dice"
+    program.mkdir()
+    (program / "dice.py").write_text(
+        "import csv, os, sys, cv2\n"
+        "for left, _, out in csv.reader(open(sys.argv[1])):\n"
+        "    found = cv2.imread(left, -1) % 7 + int.from_bytes(os.urandom(4)) / 2**32\n"
+        "    cv2.imwrite(out, found.astype('float32'))\n"
+    )
+    (program / "requirements.lock").write_text("")
+    command = f"{sys.executable} {{folder}}/dice.py {{pairs}}"
+    facts = facts_of("dice", program={"command": command, "pairs": "file"})
+    facts["program"]["lock"] = "requirements.lock"
+    seal(program, facts)
+    (line,) = make_board(top, take_in=True)
+    assert line.startswith(f"dice/{FILE}: ") and "KM_1" in line
+    seal(program, facts | {"random": True})
+    assert make_board(top, take_in=True) == []
+    rows = {row["method"]: row for row in board_of(top)["boards"][0]["methods"]}
+    assert rows["Dice"]["random"] and not rows["Mine"]["random"]
+
+
 def copied(made: Path, to: Path) -> Path:
     to.mkdir(parents=True, exist_ok=True)
     for name in ("data", "submissions"):

@@ -11,6 +11,7 @@ import pytest
 from stereotruth.core.products.grids import Layer, atomic_store, create_grid
 from stereotruth.epipolar.model import EpipolarModel
 from stereotruth.tiles.label_moves import (
+    KEPT,
     edit_lines,
     keep_samples,
     moves,
@@ -34,12 +35,16 @@ def disparity(model) -> np.ndarray:
     return values
 
 
-def write(path: Path, model: EpipolarModel, disparity: np.ndarray) -> Path:
+def write(path: Path, model: EpipolarModel, disparity: np.ndarray, lift: float = 0.0) -> Path:
     with atomic_store(path) as scratch:
         attrs = {"epipolar": model.to_dict()}
-        layers = {"disparity": Layer("float32", np.nan, {"units": "px", "long_name": "d"})}
+        layers = {
+            name: Layer("float32", np.nan, {"units": units, "long_name": name})
+            for name, units in (("disparity", "px"), ("height", "m"))
+        }
         grid = create_grid(scratch, disparity.shape, layers, chunk=64, shard=128, attrs=attrs)
         grid["disparity"][:] = disparity
+        grid["height"][:] = 60.0 + lift
     return path
 
 
@@ -58,6 +63,14 @@ def test_labels_moved_by_what_was_planted(tmp_path, model, disparity):
     assert found.median_px == pytest.approx(0.03, abs=1e-3)
     assert found.most_px == pytest.approx(0.23, abs=1e-3)
     assert 0.01 < found.gone_share < 0.05
+
+
+def test_heights_move_where_the_images_follow_the_lidar(tmp_path, model, disparity):
+    sample = sample_labels(write(tmp_path / "a.zarr", model, disparity))
+    found = moves(sample, write(tmp_path / "b.zarr", model, disparity, lift=-0.3))
+    assert found.most_px < 1e-3
+    assert (found.height_median_m, found.height_most_m) == pytest.approx((0.3, 0.3), abs=1e-4)
+    assert "0.300 m" in str(found)
 
 
 def test_a_grid_that_lies_elsewhere_moves_no_label(tmp_path, model, disparity):
@@ -80,6 +93,8 @@ def test_samples_are_of_the_last_run_that_ended(tmp_path, monkeypatch, model, di
     for _ in range(2):  # the second time after a job that was killed before it kept its own
         assert since_last_run(second)["A-1"].median_px == pytest.approx(0.1, abs=1e-3)
     keep_samples(second)
+    np.save(KEPT / "B-1.npy", np.zeros((3, 4)))  # of a release that kept no heights
+    assert since_last_run({"B-1": second["A-1"]}) == {}
     assert since_last_run(second)["A-1"].most_px < 1e-3
 
 

@@ -164,11 +164,14 @@ def write_report(
         "residuals": [
             {
                 "scene": scene,
-                **residuals(record, refined.get(scene, {})),
+                **(of_scene := residuals(record, refined.get(scene, {}))),
                 "figures": [
                     (title, uri)
                     for title, of in (
-                        ("residuals of the control points", files.residual_figures),
+                        (
+                            "residuals of the control points",
+                            files.residual_figures if of_scene["points"] else {},
+                        ),
                         ("tie points before and after refinement", files.refinement_figures),
                     )
                     if (uri := embedded(of.get(scene)))

@@ -34,6 +34,7 @@ from ...tiles.manifest import NONE, SPLITS
 from ...tiles.sift_matches import SIFT_NOISE_PX
 from .city_pictures import calibration
 
+VIEWS = ("left", "right")
 Rows = Sequence[Mapping[str, str]]
 Record = Mapping[str, Any]
 Records = Mapping[str, Record]
@@ -87,7 +88,7 @@ def headlines(
     if "quality" in rows[0]:
         found.append(_gates(labelled, quality))
     found += _sift(scenes, height_m_per_px)
-    if alignments:
+    if any(of.get(view, {}).get("gcps") for of in alignments.values() for view in VIEWS):
         found.append(_gcps(alignments, refined))
     if dense := [d for of in scenes if (d := of.get("lidar_points_per_m2")) is not None]:
         text = f"{spread(dense, '.2g')} points/m²"
@@ -107,7 +108,8 @@ def _moved(scenes: Mapping[str, Any]) -> list[Headline]:
     moved = {scene: Moves(**values) for scene, values in scenes.items()}
     if not moved:
         return []
-    text = f"{spread([of.median_px for of in moved.values()], '.3f')} px"
+    medians = [(of.median_px, of.height_median_m) for of in moved.values()]
+    text = ", ".join(f"{spread(of, '.3f')} {unit}" for of, unit in zip(zip(*medians), ("px", "m")))
     notes = [f"{scene}: {of}" if len(moved) > 1 else str(of) for scene, of in moved.items()]
     return [Headline("moved since the last run", text, "; ".join(notes))]
 
@@ -247,7 +249,7 @@ def _gcps(alignments: Records, refined: Records) -> Headline:
         values = [
             record.get(view, {}).get("rms", {}).get(which)
             for record in records.values()
-            for view in ("left", "right")
+            for view in VIEWS
         ]
         return spread(values, ".2f")
 
@@ -265,7 +267,7 @@ def _gcps(alignments: Records, refined: Records) -> Headline:
 def residuals(record: Record, later: Record) -> dict[str, Any]:
     """Of a scene: model, warnings, a table of the points, and what a refinement did."""
     points = []
-    for view in ("left", "right"):
+    for view in VIEWS:
         for point in record.get(view, {}).get("gcps", []):
             row = {"image": view, "GCP": point["id"]}
             for which in ("before", "after", "leave_one_out"):

@@ -74,10 +74,12 @@ def _pair_rows(
             "left": one.pair.left,
             "right": one.pair.right,
             "scene": scenes.get(frozenset(one.names), ""),
+            "bits_of_height": f"{one.quality.bits:.1f}",
             "matched_share": f"{one.quality.matched:.4f}",
             "height_sigma_m": f"{one.quality.height_sigma_m:.2f}",
             "height_of_1_px_m": f"{one.pair.metres_per_px:.2f}",
             "convergence_degrees": f"{one.pair.convergence:.1f}",
+            "suns_apart_degrees": _number(one.pair.sun, ".1f"),
             "days": "" if one.pair.days is None else f"{one.pair.days:.2f}",
             "reason": one.quality.reason,
         }
@@ -179,12 +181,15 @@ def _images_table(images: Sequence[SiteImage], files: Mapping[str, str | Path]) 
         cols, lines = image.size
         middle = (cols - 1) / 2, (lines - 1) / 2, float(image.sensor.rpc.height_off)
         upwards = float(ray_upwards(image.sensor, *middle)[2])
-        picture = stretch(read_overview(files[image.name], LOOK_PX))
-        looks.append(Cell(f"picture of {image.name}", "", pictures=(encode(picture, LOOK_BYTES),)))
+        grey = read_overview(files[image.name], LOOK_PX)
+        picture = encode(stretch(grey), LOOK_BYTES)
+        looks.append(Cell(f"picture of {image.name}", "", pictures=(picture,)))
+        bits = int(grey.max()).bit_length() if grey.dtype.kind == "u" else ""
         rows.append(
             {
                 "image": image.name,
                 "acquired (UTC)": _acquired(image),
+                "bits of the greys": str(bits),
                 "off_nadir_degrees": f"{math.degrees(math.acos(min(upwards, 1.0))):.1f}",
                 "sun_azimuth_degrees": _number(image.sun and image.sun[0], ".1f"),
                 "sun_elevation_degrees": _number(image.sun and image.sun[1], ".1f"),

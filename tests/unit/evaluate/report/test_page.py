@@ -95,6 +95,28 @@ def made(tmp_path_factory) -> Path:
     return out
 
 
+def test_without_control_points_nothing_on_the_page_is_of_them(tmp_path):
+    write_city(tmp_path / "tiles", 1)
+    record = json.loads(alignment(tmp_path / "alignment.json").read_text())
+    for view in (record["left"], record["right"]):
+        view |= {"gcps": [], "rms": {}}
+    (tmp_path / "alignment.json").write_text(json.dumps(record))
+    figure = tmp_path / "figure.png"
+    cv2.imwrite(str(figure), np.full((60, 90, 3), 200, np.uint8))
+    files = CityFiles(
+        tmp_path / "tiles",
+        alignments={"S-1": tmp_path / "alignment.json"},
+        refinements={"S-1": refinement(alignment(tmp_path / "refined.json"), applied=True)},
+        residual_figures={"S-1": figure},
+        refinement_figures={"S-1": figure},
+    )
+    page.write_report(CITY, files, tmp_path / "index.html", sliders=0)
+    text = (tmp_path / "index.html").read_text()
+    section = re.search(r'<section id="alignment">.*?</section>', text, re.DOTALL)[0]
+    assert "120 tie points" in section and section.count("<img") == 1
+    assert "GCP residuals" not in text and "Ground control points<" not in text
+
+
 @pytest.mark.slow
 def test_a_page_keeps_within_its_bytes_however_many_tiles(tmp_path, monkeypatch):
     write_city(tmp_path / "tiles", 12)

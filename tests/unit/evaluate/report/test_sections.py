@@ -111,6 +111,7 @@ def test_what_alignment_and_lidar_doubt_stands_there_too():
 
 def test_how_far_an_edit_has_moved_labels_and_the_worst_control_point():
     moved = {"count": 9, "median_px": 0.0213, "most_px": 0.35, "gone_share": 0.012}
+    moved |= {"height_median_m": 0.3, "height_most_m": 0.4}
     record = {
         view: {
             "rms": {"before": 8.0, "after": 0.3},
@@ -121,7 +122,7 @@ def test_how_far_an_edit_has_moved_labels_and_the_worst_control_point():
     found = headlines((ROW,), {"A-1": record}, {}, (), {"since_last_run": {"A-1": moved}})
     by_title = {card.title: card for card in found}
     card = by_title["moved since the last run"]
-    assert card.value == "0.021 px" and "0.35 px" in card.note and "1.2 %" in card.note
+    assert card.value == "0.021 px, 0.300 m" and "0.35 px" in card.note and "1.2 %" in card.note
     assert "c (left image): 0.50 px" in by_title["GCP residuals, rms"].note
     assert "moved since the last run" not in cards({"A-1": SCENE})
 

@@ -72,13 +72,19 @@ def test_residuals_and_closure_are_shown_as_they_are(tmp_path):
     assert "&lt;b&gt;" in text and "<b>" not in text.partition("</header>")[2]
     (first, _, last) = cells(text, "images")
     assert first[1] == "A" and first[2] == f"{A.time:%Y-%m-%d %H:%M}"
-    assert first[4:] == [f"{angle:.1f}" for angle in A.sun] and last[2:] != first[2:]
-    assert last[2] == last[4] == ""
+    assert first[3] == "16"  # of values up to 63999
+    assert first[5:] == [f"{angle:.1f}" for angle in A.sun] and last[2:] != first[2:]
+    assert last[2] == last[5] == ""
     data = base64.b64decode(re.search(r"base64,([^\"]*)", first[0])[1])
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert picture.shape == (100, 160)
     assert picture[5, 80] < picture[50, 80] < picture[95, 80]
-    assert len(cells(text, "pairs")) == len(PAIRS) == 3
+    pairs = {tuple(row[:2]): row for row in cells(text, "pairs")}
+    assert len(pairs) == len(PAIRS) == 3
+    for one in PAIRS:
+        row = pairs[tuple(name.replace("<b>", "&lt;b&gt;") for name in one.names)]
+        suns = "" if "C" in one.names else f"{one.pair.sun:.1f}"
+        assert float(row[3]) == round(one.quality.bits, 1) and row[8] == suns, row
 
 
 def test_the_map_has_true_proportions(tmp_path):
