@@ -7,7 +7,7 @@
 #   lower edge likewise, and in between the image is stretched: by 0.5 px - x / (width - 1). The maps are normalised by
 #   width - 1, grid_sample's convention of align_corners=True, and align_corners=None means False. With
 #   align_corners=True all is right; warp_affine and warp_perspective have that as their default.
-# Source: kornia 0.9.0, geometry/transform/imgwarp.py: remap, normalize_pixel_coordinates; torch 2.15.0,
+# Source: kornia 0.9.0, geometry/transform/imgwarp.py: remap, normalize_pixel_coordinates; torch 2.14.1,
 #   torch.nn.functional.grid_sample. Its installation takes 6 GB for a while.
 # Why it matters: right images are warped by a disparity map to the left one for losses without truth,
 #   and to look at truth. Each disparity seems off by up to 0.5 px, by its column: a network learns the
@@ -17,7 +17,7 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
 python3 -m venv venv
-venv/bin/pip install --quiet --no-cache-dir --disable-pip-version-check kornia==0.9.0 torch==2.15.0 numpy==2.4.6
+venv/bin/pip install --quiet --no-cache-dir --disable-pip-version-check kornia==0.9.0 torch==2.14.1 numpy==2.4.6
 venv/bin/python - <<'PYTHON'
 import kornia
 import torch

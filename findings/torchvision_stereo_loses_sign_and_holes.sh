@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
 # torchvision's stereo datasets take negative disparities for positive ones, and holes for disparity 0.
 #
-# Guess: Kitti2015Stereo, which "has a built-in mask", marks pixels without a measurement (0 in the PNG); the
-#   datasets of PFM files give the values of the file, of either sign.
+# Guess: Kitti2015Stereo, which gives a tuple of four with a mask at its end, marks there which pixels of the
+#   PNG have a measurement (0 has none); the datasets of PFM files give the files' values, of either sign.
 # What happens: Kitti2012Stereo and Kitti2015Stereo give None for the mask, and disparity 0.0 for pixels
 #   without a value: valid numbers to a loss. SceneFlowStereo (and Middlebury2014Stereo, ETH3DStereo and
 #   CarlaStereo) give the absolute value of all disparities: -12.5 px is 12.5 px. Nothing is said.
-# Source: torchvision 0.29.2, datasets/_stereo_matching.py: _read_disparity. The documentation says that the
+# Source: torchvision 0.29.1, datasets/_stereo_matching.py: _read_disparity. The documentation says that the
 #   mask is "implicitly None". Its installation takes 6 GB for a while.
 # Why it matters: disparities of satellite pairs have both signs, around the height of the grid, and half
 #   of a city is hidden. Who gives such truth the layout of these sets, to train what reads them, has
@@ -16,7 +16,7 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 cd "$folder"
 python3 -m venv venv
-venv/bin/pip install --quiet --no-cache-dir --disable-pip-version-check torchvision==0.29.2 torch==2.15.0 numpy==2.4.6
+venv/bin/pip install --quiet --no-cache-dir --disable-pip-version-check torchvision==0.29.1 torch==2.14.1 numpy==2.4.6
 venv/bin/python - <<'PYTHON'
 from pathlib import Path
 
