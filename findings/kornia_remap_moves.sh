@@ -8,7 +8,7 @@
 #   width - 1, grid_sample's convention of align_corners=True, and align_corners=None means False. With
 #   align_corners=True all is right; warp_affine and warp_perspective have that as their default.
 # Source: kornia 0.9.0, geometry/transform/imgwarp.py: remap, normalize_pixel_coordinates; torch 2.14.1,
-#   torch.nn.functional.grid_sample. Its installation takes 6 GB for a while.
+#   torch.nn.functional.grid_sample; issue 4504 of kornia/kornia. Its installation takes 6 GB for a while.
 # Why it matters: right images are warped by a disparity map to the left one for losses without truth,
 #   and to look at truth. Each disparity seems off by up to 0.5 px, by its column: a network learns the
 #   stretch, and a right map is thought to be wrong at both sides.

@@ -8,7 +8,8 @@
 #   the same images (upsample_factor=100). The mean over 5 x 5 px around the peak is to blame: the
 #   peak of a shifted image is a sinc, with negative sides.
 # Source: opencv-python-headless 5.0.0.93 (4.14.0.94 as well), modules/imgproc:
-#   phasecorr.cpp, weightedCentroid; scikit-image 0.26.0.
+#   phasecorr.cpp, weightedCentroid; issue 9158 of opencv/opencv;
+#   scikit-image 0.26.0.
 # Why it matters: images of two dates, ortho images and LiDAR, or bands of one sensor are aligned by
 #   it. The remaining shift seems to be zero after the first pass, and 0.2 px stay in every label; shifts by
 #   windows over a scene look like steps at whole pixels.
