@@ -60,15 +60,15 @@ def choose_device(wanted: str | None) -> torch.device:
         ) from error
 
 
-def precision_of(wanted: str | None, device: torch.device) -> str:
-    """The name of a precision; None: float32 on a CPU, mixed with bfloat16 on a GPU.
+def precision_of(wanted: str | None, device: torch.device, on_gpu: str = "float32") -> str:
+    """The name of a precision; None: float32 on a CPU, ``on_gpu`` on a GPU.
 
     float32 on a CPU that does not have what is wanted: there it would take 40 times as long.
     """
     if wanted and device.type == "cpu" and not _is_computed(wanted):
         log.warning("this processor computes no %s: float32 is taken, which is faster", wanted)
         return "float32"
-    return wanted or ("bfloat16" if device.type == "cuda" else "float32")
+    return wanted or (on_gpu if device.type == "cuda" else "float32")
 
 
 def _is_computed(precision: str) -> bool:
@@ -78,9 +78,15 @@ def _is_computed(precision: str) -> bool:
 
 
 def mixed(precision: str, device: torch.device) -> Any:
-    """The context in which a network computes at that precision."""
-    kind = PRECISIONS[precision]
-    return nullcontext() if kind is None else torch.autocast(device.type, kind)
+    """The context in which a network computes at that precision.
+
+    float32 on a GPU is without TF32, which rounds what convolutions read to 11 bits.
+    """
+    if (kind := PRECISIONS[precision]) is not None:
+        return torch.autocast(device.type, kind)
+    if device.type != "cuda":
+        return nullcontext()
+    return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
 
 
 class NetworkMethod:

@@ -161,7 +161,7 @@ def _run(job: TrainingJob, rank: int, network: nn.Module, device: torch.device) 
     if not alone:
         ids = [device.index] if device.type == "cuda" else None
         shared = nn.parallel.DistributedDataParallel(network, device_ids=ids)
-    precision = precision_of(training.precision, device)
+    precision = precision_of(training.precision, device, "bfloat16")
     scaler = torch.amp.GradScaler(device.type, enabled=precision == "float16")
 
     def keep() -> None:

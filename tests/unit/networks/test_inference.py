@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: make test-networks")
 from stereobench.methods.kinds import NETWORKS
-from stereobench.networks import weights
+from stereobench.networks import inference, weights
 from stereobench.networks.inference import NetworkMethod
 from stereobench.networks.weights import SavedNetwork
 from stereotruth.core.errors import InputError
@@ -97,3 +97,12 @@ def test_ranges_are_widened_to_the_networks_planes(kind: str) -> None:
     first = {"stereonet": -104, "psmnet": -104, "hmsmnet": -112}[kind]
     with pytest.raises(InputError, match=rf"multiples of .* take \({first}, "):
         SavedNetwork(kind, (-103, 90)).build()
+
+
+def test_a_gpu_matches_at_the_precision_of_a_processor_and_trains_faster():
+    gpu, before = torch.device("cuda"), torch.backends.cudnn.allow_tf32
+    assert inference.precision_of(None, gpu) == "float32"
+    assert inference.precision_of(None, gpu, "bfloat16") == "bfloat16"
+    with inference.mixed("float32", gpu):
+        assert not torch.backends.cudnn.allow_tf32
+    assert torch.backends.cudnn.allow_tf32 == before
