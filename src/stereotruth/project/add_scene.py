@@ -1,8 +1,10 @@
-"""A scene's row in the sheets, from a delivery: images, views, LiDAR."""
+"""A delivery's rows in the sheets: a scene (images, views, LiDAR), or the images of a site."""
 
 from __future__ import annotations
 
+import math
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,6 +16,7 @@ from ..align.control_points import ControlPoints, read_gcps
 from ..align.gcp_checks import fit_exchanged, misfits_of_sides
 from ..align.images import open_view
 from ..core import sheets
+from ..core.config.configuration import Configuration
 from ..core.errors import InputError
 from ..core.products.files import files_below
 from ..core.products.rasters import open_raster
@@ -29,7 +32,7 @@ from .check_scene import boxes_of, ground_of
 from .expected import Nodes, check_frame
 from .findings import Findings, Level
 from .list_tiles import list_tiles, margin_of
-from .new_project import append_row, city_row
+from .new_project import append_row, check_and_run, city_row
 from .project import configured, read_rows, sheet, with_stand_ins
 
 SUFFIXES = {".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img"}
@@ -49,40 +52,40 @@ def _view(file: Path) -> str:
     return next((view for view, words in VIEWS if words.search(file.name)), "")
 
 
-def find_pair(given: Sequence[Path]) -> tuple[tuple[Image, Image], list[str]]:
-    """The two images of a delivery's folder, or those that are named; and remarks.
+def find_images(given: Sequence[Path]) -> tuple[list[Image], list[str]]:
+    """The images of a delivery's folder, or those that are named, two at least; and remarks.
 
-    Left first where the names of the files say it, or who names them one by one. Raises
-    InputError, naming what there is, if there are not two, or one has no RPC that can be read.
+    Of two, left first where the names of the files say it, or who names them one by one. Raises
+    InputError if there are fewer than two, or one has no RPC that can be read.
     """
     given = [Path(path) for path in given]
     for path in given:
         if not path.exists():
             raise InputError("no such file or folder", file=path, remedy="correct the path")
-    if len(given) == 2 and all(path.is_file() for path in given):
+    if len(given) > 1 and all(path.is_file() for path in given):
         files, lines = given, []
     elif all(path.is_dir() for path in given):
         files, lines = _in_folders(given)
     else:
         raise InputError(
-            "is not two images, nor a folder",
+            "is one image, or images beside a folder",
             file=given[0],
-            remedy="name the delivery's folder (or both folders), or the left and right image",
+            remedy="name the delivery's folders, or left and right image, or all images of a site",
         )
     images = [Image(f, _view(f), *open_view(_view(f) or "first", f, "")) for f in files]
     if {image.view for image in images} == {"left", "right"}:
         images.sort(key=lambda image: image.view)
-    elif files == given:  # named one by one: left, right
+    elif files == given and len(given) == 2:  # left, right
         images = [replace(image, view=view) for image, view in zip(images, ("left", "right"))]
     for image in images:
         source = rpc_file(image.path)
         told = "its own metadata" if source == image.path else source.name
         lines.append(f"{image.path.name}: {image.size[0]} x {image.size[1]} px, RPC from {told}")
-    return (images[0], images[1]), lines
+    return images, lines
 
 
 def _in_folders(folders: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """The files of the pair below folders, and remarks on those that were passed over."""
+    """The files of the images below folders, and remarks on those that were passed over."""
     every = sorted(file for folder in folders for file in files_below(folder) if file.is_file())
     files = [file for file in every if file.suffix.lower() in SUFFIXES]
     mosaics = [file for file in every if file.suffix.lower() == ".til"]
@@ -98,14 +101,12 @@ def _in_folders(folders: Sequence[Path]) -> tuple[list[Path], list[str]]:
     lines = []
     if passed := [file.name for file in files if file not in wanted]:
         lines.append(f"passed over: {', '.join(passed[:6])}" + " …" * (len(passed) > 6))
-    if len(wanted) != 2:
-        there = ", ".join(str(file) for file in wanted[:8]) or "none"
+    if len(wanted) < 2:
+        there = ", ".join(map(str, wanted)) or "none"
         raise InputError(
             f"{len(wanted)} images that may be of the pair: {there}",
             file=folders[0],
-            remedy="name the two: stereotruth scene add LEFT RIGHT --lidar …; list more than two "
-            "of a place in images.tsv (key images of config.yaml), and let stereotruth pairs "
-            "choose",
+            remedy="name the two: stereotruth scene add LEFT RIGHT --lidar …",
         )
     return wanted, lines
 
@@ -150,22 +151,28 @@ def add_scene(
     lidar_crs: str = "",
     geoid: str = "",
     hosts: Sequence[str] = (),
+    column: str = "",
     configfiles: Sequence[Path] | None = None,
 ) -> list[str]:
     """Append the scene's row to the scenes sheet, and its city's if it is new.
 
-    ``lidar`` may be a catalogue: its tiles are listed (:mod:`.list_tiles`), ``hosts`` may be led
-    to. Returns what was found, line by line. Raises InputError if there is no usable pair, LiDAR or
-    file, before anything is written.
+    More than two images are those of a site: they are listed, and no scene is written. ``lidar``
+    may be a catalogue: its tiles are listed (:mod:`.list_tiles`), ``hosts`` may be led to,
+    ``column`` has their locations. Returns what was found, line by line. Raises InputError if there
+    is no usable pair, LiDAR or file, before anything is written.
     """
     settings, _ = configured(configfiles)
     rows, towns = (Path(sheet(settings, kind)) for kind in ("scenes", "cities"))
     cities, scenes, _ = read_rows(settings)
-    pair, lines = find_pair(delivery)
-    _refuse_repeated(pair, scenes, rows)
+    images, lines = find_images(delivery)
     first = delivery[0].absolute()
     folder = first if first.is_dir() else first.parent
     city = city or re.sub(r"[^A-Za-z0-9-]+", "-", folder.name).strip("-") or "City"
+    if len(images) > 2:
+        given = {"lidar": lidar, "lidar-crs": lidar_crs, "geoid": geoid, "gcps": gcps}
+        return lines + _add_site(images, city, settings, given)
+    pair = images[0], images[1]
+    _refuse_repeated(pair, scenes, rows)
     numbered = (f"{re.sub(r'[^A-Za-z0-9-]', '-', city)}-{k}" for k in range(1, 10_000))
     name = name or next(name for name in numbered if name not in scenes)
     if name in scenes:
@@ -173,8 +180,8 @@ def add_scene(
             f"scene {name!r} is there already", file=rows, remedy="take another --name"
         )
     if is_catalogue(lidar):
-        images = [(str(pair[0].path), str(pair[1].path))]
-        listed, more = list_tiles(lidar, images, margin_of(settings), frozenset(hosts))
+        files = [(str(pair[0].path), str(pair[1].path))]
+        listed, more = list_tiles(lidar, files, margin_of(settings), frozenset(hosts), column)
         lidar, lidar_crs = f"lidar/{name}.tsv", lidar_crs or listed.crs
         write_list(listed, lidar)
         lines += more
@@ -207,18 +214,57 @@ def add_scene(
         if apart(lidar_box, images_box):
             refuse_apart(lidar_box, images_box, range_m, placed[0].path.parent)
     cells |= {"left_image": str(pair[0].path), "right_image": str(pair[1].path)}
-    check_frame(Nodes.of(model), settings, found)
+    nodes = Nodes.of(model)
+    check_frame(nodes, settings, found)
     lines += words
     for finding in found:
         remedy = f". Remedy: {finding.remedy}" if finding.remedy else ""
         lines.append(f"{finding.about}: {finding.text}{remedy}")
-    if city not in cities:
-        made = sheets.check(city_row(city, _prefix(city, cities)), sheets.City, f"city {city}")
-        append_row(towns, asdict(made))
-        lines.append(f"{towns}: city {city}, tiles named {made.prefix}_…, split 6 : 1 : 3")
+    lines += _add_city(city, cities, towns)
     append_row(rows, cells)
-    lines.append(f"{rows}: scene {name} of {city}. Next: stereotruth check {name}")
+    smaller = _smaller_tiles(nodes.largest, settings)
+    lines.append(f"{rows}: scene {name} of {city}. Next: {smaller}{check_and_run(city)}")
     return lines
+
+
+def _add_site(
+    images: Sequence[Image], city: str, settings: Configuration, given: Mapping[str, str]
+) -> list[str]:
+    """List those images of a site that are new; the next step has the options ``given``."""
+    if not settings.images:
+        remedy = "add images: images.tsv, a file with the columns image, city, file"
+        raise InputError("the configuration names no images sheet", remedy=remedy)
+    cities, _, known = read_rows(settings)
+    listed = {sheets.file_key(image.file) for image in known.values()}
+    paths = [one.path for one in images if sheets.file_key(str(one.path)) not in listed]
+    lines = _add_city(city, cities, Path(sheet(settings, "cities")))
+    for name, path in sheets.store_names(paths).items():
+        row = {"image": re.sub(r"[^A-Za-z0-9_-]", "-", name), "city": city, "file": path}
+        append_row(Path(settings.images), row)
+    smaller = _smaller_tiles(min(min(image.size) for image in images), settings)
+    words = "".join(f" --{key} {shlex.quote(text)}" for key, text in given.items() if text)
+    lines.append(
+        f"{settings.images}: {len(paths)} images of {city}. "
+        f"Next: {smaller}stereotruth pairs {city} --most 1{words}"
+    )
+    return lines
+
+
+def _smaller_tiles(side: int, settings: Configuration) -> str:
+    """What to do first where no tile of the default size fits into a square of ``side`` px."""
+    if side >= settings.tiles.size or "tiles" in settings.model_fields_set:
+        return ""
+    size = 2 ** int(math.log2(max(side, 32) / 2))
+    return f"echo 'tiles: {{size: {size}}}' >> config.yaml && "
+
+
+def _add_city(city: str, cities: Mapping[str, sheets.City], towns: Path) -> list[str]:
+    """The row of a city that is new, and what it is."""
+    if city in cities:
+        return []
+    made = sheets.check(city_row(city, _prefix(city, cities)), sheets.City, f"city {city}")
+    append_row(towns, asdict(made))
+    return [f"{towns}: city {city}, tiles named {made.prefix}_…, split 6 : 1 : 3"]
 
 
 def _refuse_repeated(
@@ -284,7 +330,7 @@ def in_order(
     return (one, other), model, [f"left: {one.path}", f"right: {other.path}", words]
 
 
-def _prefix(city: str, cities: dict[str, sheets.City]) -> str:
+def _prefix(city: str, cities: Mapping[str, sheets.City]) -> str:
     """Two letters or more of the city that no other has."""
     letters = re.sub(r"[^A-Za-z0-9]", "", city).upper() or "C"
     taken = {other.prefix for other in cities.values()}

@@ -137,7 +137,7 @@ def init(
         ),
     ] = None,
 ) -> None:
-    """Begin a project: config.yaml, scenes.tsv, cities.tsv and gcps/."""
+    """Begin a project: config.yaml, gcps/, and sheets of scenes, cities and images."""
     if twin is not None:
         from stereocities.twin_world import SUN_DEG
 
@@ -174,7 +174,8 @@ def init(
 )
 def scene_add(
     delivery: Annotated[
-        list[Path], typer.Argument(help="Folder of the delivery, or left and right image.")
+        list[Path],
+        typer.Argument(help="Folder of the delivery, or left and right image, or many of a place."),
     ],
     lidar: Annotated[
         str,
@@ -188,6 +189,7 @@ def scene_add(
     lidar_crs: Annotated[str, typer.Option(help="CRS of LiDAR files without one.")] = "",
     geoid: Annotated[str, typer.Option(help="Geoid grid of orthometric heights.")] = "",
     allow_host: AllowedHosts = None,
+    column: Annotated[str, typer.Option(help="Of a tile index, with locations.")] = "",
     configfile: Configured = None,
 ) -> None:
     """Find images, RPCs and views in a delivery, look at the LiDAR, and write the scene's row."""
@@ -203,6 +205,7 @@ def scene_add(
             lidar_crs=lidar_crs,
             geoid=geoid,
             hosts=allow_host or (),
+            column=column,
             configfiles=configfile,
         )
     )
@@ -351,6 +354,7 @@ def pairs(
 @app.command(
     context_settings=PASSED_ON,
     options_metavar="",
+    short_help="Make tiles, pages or datasets: all that [cyan]stereotruth targets[/cyan] lists.",
     help="Run the workflow in this folder, with its config.yaml; without a target it makes the "
     "tiles of all cities. [cyan]stereotruth targets[/cyan] lists what can be made. Any option goes "
     "to Snakemake as it is; where none says how many cores, it takes all. "

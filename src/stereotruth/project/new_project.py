@@ -11,12 +11,11 @@ from pathlib import Path
 
 from ..core.errors import InputError
 from ..core.products.files import refuse_others
-from ..core.sheets import City, Scene
+from ..core.sheets import City, Image, Scene
 from .project import FILES
 
 # Keys that people change, of each section of the configuration; () where the section is one key.
 KEYS: dict[str, tuple[str, ...]] = {
-    "images": (),
     "strict": (),
     "seed": (),
     "ingest": ("drop_classes",),
@@ -30,6 +29,7 @@ HEAD = """\
 # Paths count from this folder. All keys: {keys}
 scenes: scenes.tsv
 cities: cities.tsv
+images: images.tsv
 """
 
 SHIPPED = {
@@ -67,8 +67,9 @@ def begin(folder: str | Path) -> str:
     refuse_others(folder)
     (folder / "gcps").mkdir(parents=True)
     (folder / "config.yaml").write_text(configuration_text(), encoding="utf-8")
-    for name, columns in (("scenes", Scene), ("cities", City)):
-        header = "\t".join(f.name for f in fields(columns) if f.default is MISSING)
+    for name, columns in (("scenes", Scene), ("cities", City), ("images", Image)):
+        wanted = (f for f in fields(columns) if columns is Image or f.default is MISSING)
+        header = "\t".join(f.name for f in wanted)
         (folder / f"{name}.tsv").write_text(f"{header}\n", encoding="utf-8")
     return "stereotruth scene add DELIVERY --lidar FOLDER"
 
@@ -82,6 +83,11 @@ def append_row(file: Path, cells: Mapping[str, object]) -> None:
         if not text.endswith("\n"):
             stream.write("\n")
         csv.writer(stream, delimiter="\t", lineterminator="\n").writerow(row)
+
+
+def check_and_run(city: str) -> str:
+    """The command that makes a city's tiles and page, once ``check`` finds no error."""
+    return f"stereotruth check && stereotruth run tiles/{city} report"
 
 
 def city_row(name: str, prefix: str) -> dict[str, object]:

@@ -27,7 +27,7 @@ from ..sensor.site_pairs import (
     rate,
 )
 from .findings import plain_table, wide
-from .new_project import append_row
+from .new_project import append_row, check_and_run
 from .project import configured, names_in_pair, read_rows, sheet
 from .site import images_of, scene_pairs
 
@@ -196,7 +196,7 @@ def write_pairs(
         written += 1
     how = ", to link the images and to differ in convergence" if choice.most else ""
     said = f"{rows}: {written} of {len(rated)} pairs written{how}"
-    return f"{said}. Next: stereotruth check {city}"
+    return f"{said}. Next: {check_and_run(city)}"
 
 
 def _free_name(pair: SitePair, scenes: dict[str, sheets.Scene]) -> str:

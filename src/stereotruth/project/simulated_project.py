@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stereocities.cities import (
@@ -22,7 +22,6 @@ from stereocities.sites import SiteSpec, images_drawn, simulate_site_image, simu
 from stereocities.twin_world import SUN_DEG, twin_city
 
 from ..core.errors import InputError
-from ..core.sheets import Image
 from .new_project import append_row, begin, city_row
 
 DEMO = CitySpec(
@@ -90,8 +89,6 @@ def make_site(folder: Path) -> str:
     data, points = folder / "data", folder / "gcps" / f"{SITE.city.name}.csv"
     simulate_site_points(SITE, points, data / "gcps_exact.csv", seed=SEED)
     _make_lidar(SITE.city, data / "lidar")
-    sheet = folder / "images.tsv"
-    sheet.write_text("\t".join(field.name for field in fields(Image)) + "\n", encoding="utf-8")
     for image in SITE.images:
         file = data / f"{image.name}.tif"
         simulate_site_image(SITE, image, file, seed=SEED)
@@ -102,9 +99,9 @@ def make_site(folder: Path) -> str:
             "file": file.relative_to(folder),
             "acquired": acquired,
         }
-        append_row(sheet, row)
+        append_row(folder / "images.tsv", row)
     append_row(folder / "cities.tsv", city_row(SITE.city.name, "ST"))
-    append_settings(folder, ["images: images.tsv", *TILES])
+    append_settings(folder, TILES)
     return (
         f"stereotruth pairs {SITE.city.name} --most 4 --lidar data/lidar "
         f"--gcps gcps/{SITE.city.name}.csv"

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import csv
+import shlex
 import shutil
 from pathlib import Path
 
 import pytest
 import rasterio
+from typer.testing import CliRunner
 
 from stereotruth.core.errors import InputError
 from stereotruth.core.sheets import read_cities, read_scenes
 from stereotruth.project.add_scene import add_scene
 from stereotruth.project.check import check_project
+from stereotruth.project.main import app
+from stereotruth.project.new_project import begin
+from stereotruth.project.project import configured, read_rows
 
 from ...synthetic.broken_scenes import with_pixels, write_lidar
 from ...synthetic.rpc_texts import dimap_text, rpb_text
@@ -86,6 +91,22 @@ def test_views_of_a_delivery(folder, make, left, right):
     assert cities["Qichun"].prefix == "QI"
     assert list(read_scenes("scenes.tsv", cities)) == ["Good-1", "Qichun-1"]
     assert not any(findings.failed for findings in check_project(names=["Qichun"]))
+
+
+def test_a_sites_images_are_listed_and_the_command_said_last_chooses_a_pair(folder, monkeypatch):
+    images = [*copied(folder, "a", "b"), folder / "named/c.1.tif"]
+    shutil.copy(images[0], images[2])
+    begin(folder / "site")
+    monkeypatch.chdir(folder / "site")
+    lines = add_scene([Path("../named")], lidar="../lidar", gcps="../gcps.csv", city="Site")
+    assert list(read_rows(configured()[0])[2]) == ["a", "b", "c-1"]
+    before = Path("images.tsv").read_text()
+    add_scene(images, lidar="../lidar", city="Site")  # once only
+    assert Path("images.tsv").read_text() == before
+    choose = shlex.split(lines[-1].partition("Next: stereotruth ")[2])
+    assert CliRunner().invoke(app, choose).exit_code == 0
+    assert (row()["city"], row()["gcps"]) == ("Site", "../gcps.csv")
+    assert list(read_rows(configured()[0])[1]) == [row()["scene"]]
 
 
 def test_images_that_are_named_keep_their_order(folder):

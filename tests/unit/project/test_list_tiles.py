@@ -190,12 +190,12 @@ def test_lists_of_different_systems_are_not_mixed(folder):
         read_scenes(configured()[0])
 
 
-def add_with(folder: Path, catalogue: str) -> list[str]:
+def add_with(folder: Path, catalogue: str, **options: str) -> list[str]:
     """Add the good scene once more, as Good-2."""
-    (folder / "named").mkdir()
+    (folder / "named").mkdir(exist_ok=True)
     for view in ("left", "right"):
         (folder / "named" / f"{view}.tif").write_bytes((folder / f"{view}.tif").read_bytes())
-    return add_scene([folder / "named"], lidar=catalogue, gcps="gcps.csv", city="Good")
+    return add_scene([folder / "named"], lidar=catalogue, gcps="gcps.csv", city="Good", **options)
 
 
 def test_a_scene_is_added_with_a_catalogue(folder):
@@ -205,6 +205,20 @@ def test_a_scene_is_added_with_a_catalogue(folder):
     assert read_list("lidar/Good-2.tsv").catalogue == name
     assert scenes["Good-2"].lidar.count(";") + 1 == len(read_list("lidar/Good-2.tsv").tiles)
     assert any("lie on the" in line for line in lines)
+
+
+def test_a_column_of_an_index_may_be_named_for_a_scene(folder):
+    index = [
+        {"type": "Feature", "geometry": one["geometry"],
+         "properties": {"name": one["assets"]["data"]["href"],
+                        "url": f"tiles/{one['assets']['data']['href']}"}}
+        for one in items_of(folder)
+    ]  # fmt: skip
+    name = catalogue(folder, index, "index.geojson")
+    with pytest.raises(InputError):
+        add_with(folder, name)
+    add_with(folder, name, column="url", lidar_crs=SYSTEM)
+    assert all(tile.file.startswith("tiles/") for tile in read_list("lidar/Good-2.tsv").tiles)
 
 
 class Site:

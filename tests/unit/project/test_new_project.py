@@ -40,9 +40,9 @@ def test_what_is_commented_are_the_defaults():
     lines = configuration_text().splitlines()
     text = "\n".join(line.removeprefix("# ") for line in lines[2:])
     values = yaml.safe_load(text)
-    assert set(values) == set(KEYS) | {"scenes", "cities"}
+    assert set(values) == set(KEYS) | {"scenes", "cities", "images"}
     assert all(set(values[section]) == set(keys) for section, keys in KEYS.items() if keys)
-    sheets = {"scenes": "scenes.tsv", "cities": "cities.tsv"}
+    sheets = {name: f"{name}.tsv" for name in ("scenes", "cities", "images")}
     assert Configuration.of(values) == Configuration.of(sheets)
 
 
