@@ -1,9 +1,9 @@
 """Input functions: which files a stage takes of a scene or a city."""
 
 from functools import cache
-from importlib.util import find_spec
 
-from stereotruth.core.errors import install_extra
+from stereotruth.core.config.configuration import NEEDED
+from stereotruth.core.errors import InputError, require_packages
 from stereotruth.sensor.deliveries import files_beside
 
 
@@ -272,13 +272,11 @@ def cities_of_report():
 
 def tiles_of_dataset(wildcards):
     """All cities' tiles. Packages that are missing are told before a dataset that is there goes."""
-    needs = {"stac": "pystac", "croissant": "mlcroissant", "parquet": "pyarrow"}
     for asked in (*SETTINGS.dataset.catalogs, *SETTINGS.dataset.layouts):
-        if asked in needs and find_spec(needs[asked]) is None:
-            raise Refused(
-                f"dataset: {asked} needs {needs[asked]}, which is not installed. Remedy: "
-                f"{install_extra('catalog')}; or leave it out"
-            )
+        try:
+            require_packages(f"dataset: {asked}", NEEDED.get(asked, ()), "catalog")
+        except InputError as error:
+            raise Refused(str(error))
     return expand("tiles/{city}", city=CITIES)
 
 

@@ -18,8 +18,7 @@ from __future__ import annotations
 
 import logging
 import math
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stereotruth.core.config.configuration import Limits
 from stereotruth.core.config.methods import AuditLimits
 from stereotruth.core.errors import InputError, in_number
 from stereotruth.core.job import progress
@@ -36,14 +36,14 @@ from stereotruth.core.numerics.arrays import Floats
 from stereotruth.core.numerics.statistics import reweighted_fit, tukey_weights
 from stereotruth.core.products.files import (
     atomic_folder,
+    copy,
     files_below,
     is_foreign,
     path_below,
     read_record,
-    read_table,
+    read_sealed,
     refuse_others,
     sealed,
-    write_table,
 )
 from stereotruth.core.products.provenance import file_sha256
 from stereotruth.core.products.rasters import (
@@ -51,11 +51,17 @@ from stereotruth.core.products.rasters import (
     read_disparity,
     read_image,
     read_labels,
+    read_tile,
     write_tiff,
 )
-from stereotruth.tiles.manifest import disparity_cells, refuse_changed
-from stereotruth.tiles.quick_looks import NUMBERS, read_footprints, write_footprints
+from stereotruth.tiles.layouts import catalogs_of, write_tables
+from stereotruth.tiles.manifest import disparity_cells, read_manifest, refuse_changed
+from stereotruth.tiles.quick_looks import feature, read_footprints
+from stereotruth.tiles.seals import FILE as SEAL
 from stereotruth.tiles.stereo_dataset import StereoDataset
+from stereotruth.tiles.tile_checks import check_cells, flagged, reach_of
+from stereotruth.tiles.tile_files import LabelsKnown, check_labels
+from stereotruth.tiles.verify import write_export
 
 from .estimates import SMALLEST_SCALE, cells, robust_fit, share
 from .label_checks import LARGER, SMALLER, WRONG_PX
@@ -75,7 +81,7 @@ log = logging.getLogger("stereotruth")
 
 Labels = NDArray[np.float32]  # [h, w] px, NaN: none
 
-ERRATA = "errata.json"
+ERRATA, EXPORT = "errata.json", "export.json"
 MENDED = ("values", "convention", "bias", "hidden", "contradicted")  # checks
 HIDDEN, CONTRADICTED, NODATA = 1, 2, 3  # in masks
 MEANINGS = {HIDDEN: "hidden", CONTRADICTED: "contradicted", NODATA: "nodata"}
@@ -314,9 +320,9 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
     """Copy ``dataset`` to the new folder ``out`` with its labels corrected; how many files are.
 
     Files are found by name, wherever they lie. They are held against the checksums of the errata,
-    and all that a manifest lists against those of the manifest, before anything is written. The
-    copy's manifest tells of the corrected labels; ``export.json``, which seals the one before,
-    stays behind.
+    and all that a manifest lists against those of the manifest, before anything is written. What
+    the copy states of its labels (manifest, footprints, catalogs, ``export.json``) is of the
+    corrected ones. The seal of labels that were held back stays behind.
 
     Raises InputError if a file is missing or another one, if the errata are not as they were
     written, or if there is something at ``out``.
@@ -337,35 +343,65 @@ def apply_errata(delta: str | Path, dataset: str | Path, out: str | Path) -> int
                 remedy="get the version of the dataset that was audited, or audit this one",
             )
         found[file] = record
-    if (dataset / "manifest.csv").is_file():
+    if has_manifest := (dataset / "manifest.csv").is_file():
         refuse_changed(dataset)
-        files = [file for file in files if file != dataset / "export.json"]
+        not_copied = (SEAL, EXPORT, "croissant.json", "stac") if found else ()
+        files = [f for f in files if f.relative_to(dataset).parts[0] not in not_copied]
     with atomic_folder(out) as scratch:
         for file in progress(files, len(files), f"{out}: files"):
             target = scratch / file.relative_to(dataset)
-            target.parent.mkdir(parents=True, exist_ok=True)
+            copy(file, target)
             if file in found:
                 _write_corrected(file, target, found[file], delta, none)
-            else:
-                shutil.copyfile(file, target)
-        if (manifest := scratch / "manifest.csv").is_file():
-            changed = {file.relative_to(dataset).as_posix() for file in found}
-            rows = list(read_table(manifest))
-            renewed = [row for row in rows if row.get("disp") in changed]
-            places = read_footprints(scratch) if renewed else {}
-            for row in renewed:
-                file = scratch / row["disp"]
-                cells = disparity_cells(read_disparity(file, none))
-                row |= {"disp_sha256": file_sha256(file)}
-                row |= {name: cell for name, cell in cells.items() if name in row}
-                if place := places.get(row.get("tile", "")):
-                    numbers = {name: float(cells[name]) for name in NUMBERS if cells[name]}
-                    place["properties"] |= dict.fromkeys(NUMBERS) | numbers
-            write_table(manifest, rows)
-            if places:
-                write_footprints(scratch, places.values())
+        if has_manifest and found:
+            _tell(scratch, dataset, {f.relative_to(dataset).as_posix() for f in found}, none)
     log.info("%s: labels of %s corrected", out, in_number(len(found), "pair"))
     return len(found)
+
+
+def _tell(folder: Path, dataset: Path, corrected: Collection[str], nodata: float) -> None:
+    """Write what the copy of a dataset states of its labels, as it was written of the dataset.
+
+    Of a scene with corrected labels nothing is stated that its tiles alone do not tell.
+    """
+    rows, places = read_manifest(dataset), read_footprints(dataset)
+    record = read_sealed(dataset / EXPORT) if (dataset / EXPORT).is_file() else {}
+    quality = record.get("quality", {})
+    limits = Limits(**quality.get("limits", {}))
+    renewed = [row for row in rows if row.get("disp") in corrected]
+    for row in renewed:
+        cells = {"disp_sha256": file_sha256(folder / row["disp"])}
+        cells |= _cells(folder, row, nodata, limits)
+        row |= {name: cell for name, cell in cells.items() if name in row}
+        if place := places.get(row.get("tile", "")):
+            ring = np.array(place["geometry"]["coordinates"][0][:-1])
+            place["properties"] |= feature(row, ring)["properties"]
+    scenes = {row.get("scene") for row in renewed}
+    for row in rows:
+        if row.get("doubt") and row["scene"] in scenes:
+            row["doubt"] = ""
+    where = {row["tile"]: dataset / row["orientation"] for row in rows if row.get("orientation")}
+    write_tables(folder, rows, places, where, **catalogs_of(dataset, rows))
+    if record:
+        labelled = [row for row in rows if row["complete"] == "yes"]
+        for name in ("scenes", "surfaces", "doubts"):
+            quality[name] = {key: of for key, of in quality[name].items() if key not in scenes}
+        quality["flagged_tiles"] = flagged(labelled)
+        del record["label_uncertainty"]
+        write_export(folder, record | {"disparity_px": reach_of(labelled)}, record["provenance"])
+
+
+def _cells(folder: Path, row: Mapping[str, str], nodata: float, limits: Limits) -> dict[str, Any]:
+    """Cells of the manifest that tell of a pair's labels; their uncertainty is not known."""
+    labels = read_disparity(folder / row["disp"], nodata)
+    cells: dict[str, Any] = disparity_cells(labels)
+    if "quality" in row:
+        images = (np.nan_to_num(read_tile(folder / row[view])) for view in ("left", "right"))
+        left, right = (np.rint(image).astype(np.uint16) for image in images)
+        known = LabelsKnown(row["class"], *[np.zeros(labels.shape, np.uint8)] * 3)
+        checks = check_labels(left, right, labels.astype(np.float64), known)
+        cells |= check_cells(checks, limits)
+    return cells
 
 
 def _write_corrected(

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +33,14 @@ from stereotruth import __version__
 from stereotruth.core.config.methods import Name, Scoring, StereoDatasetEntry
 from stereotruth.core.config.section import FilePath, Section, Text, check, read_mapping
 from stereotruth.core.errors import InputError, in_number
-from stereotruth.core.products.files import atomic_folder, link
+from stereotruth.core.products.files import (
+    atomic_file,
+    atomic_folder,
+    link,
+    write_json,
+    write_table,
+)
+from stereotruth.core.products.provenance import file_sha256
 from stereotruth.pages.page import write_page
 from stereotruth.pages.pictures import ERRORS, Picture, Scale
 from stereotruth.pages.tables import Table as Shown
@@ -42,20 +48,13 @@ from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
 
 from .paired import CONFIDENCE, Sums, difference, differences, read_sums
 from .panels import ERROR_PX, error_picture
-from .prediction_files import hold_against, read_prediction
+from .prediction_files import FILE, hold_against, read_prediction
 from .predictions import predict
 from .protocols import PROTOCOLS
 from .score_method import ScoringPlan, score
 from .scores import MIN_TILES, Scorer
 from .strata import Products, exact_truth
-from .submissions import (
-    ADMITTED,
-    Entry,
-    offered,
-    read_admitted,
-    refuse_borrowed,
-    write_admitted,
-)
+from .submissions import ADMITTED, Entry, read_admitted, refuse_borrowed
 from .tables import Figure, error_figures, of_figures
 from .tables import Table as Differences
 
@@ -130,12 +129,13 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
     settings = check(read_mapping(folder / SETTINGS), BoardSettings, folder / SETTINGS)
     places = sorted(path for path in (folder / "submissions").glob("*") if path.is_dir())
     known = read_admitted(folder)
-    admitted = known | (offered(folder, [p.name for p in places], known) if take_in else {})
+    offered = [p for p in places if take_in and p.name not in known and (p / FILE).is_file()]
+    admitted = known | {place.name: file_sha256(place / FILE) for place in offered}
     order = {name: k for k, name in enumerate(admitted)}
     places.sort(key=lambda path: (order.get(path.name, len(order)), path.name))
     tables = {name: _table(folder, name, settings) for name in settings.datasets}
     taken: list[Run] = []
-    refused, remedies = [], []
+    refused: list[dict[str, str]] = []
     for place in places:
         try:
             entry = Entry.read(place, admitted)
@@ -144,20 +144,21 @@ def make_board(folder: Path, to: Path | None = None, *, take_in: bool = False) -
             taken.append(run)
         except InputError as error:
             refused.append(_said(error, place))
-            remedies.append(error.remedy)
             if place.name not in known:
                 admitted.pop(place.name, None)
     for name in sorted(known.keys() - {place.name for place in places}):
-        refused.append({"file": name, "problem": "was admitted, and is not there any more"})
-        remedies.append(f"put it back, or take its line out of {ADMITTED}")
+        gone = "was admitted, and is not there any more"
+        remedy = f"put it back, or take its line out of {ADMITTED}"
+        refused.append({"file": name, "problem": gone, "remedy": remedy})
     if take_in:
-        write_admitted(folder, admitted)
+        rows = [{"folder": name, "sha256": sha256} for name, sha256 in admitted.items()]
+        write_table(folder / ADMITTED, rows, ("folder", "sha256"))
     for run in taken:
         table = tables[run.entry.facts["dataset"]]
         table.methods.setdefault(run.entry.method, []).append(run)
     with atomic_folder(to or folder / "site") as site:
         _write(site, settings, [of for of in tables.values() if of.methods], refused)
-    return [f"{of['file']}: {of['problem']}. Remedy: {how}" for of, how in zip(refused, remedies)]
+    return [f"{of['file']}: {of['problem']}. Remedy: {of['remedy']}" for of in refused]
 
 
 def _table(folder: Path, name: str, settings: BoardSettings) -> Table:
@@ -223,12 +224,13 @@ def _digest(disparity: NDArray[np.float32]) -> str:
 
 
 def _said(error: InputError, place: Path) -> dict[str, str]:
-    """File, from the folder of submissions on, and what is said of it, without other paths."""
+    """File, from the folder of submissions on; problem, without other paths; and remedy."""
     file = Path(error.file) if error.file else place / "submission.json"
     inside = file if file.is_relative_to(place) else place / "submission.json"
     lines = error.problem.splitlines()
     problem = " ".join(dict.fromkeys((lines[0], lines[-1]))).replace(f"{place.parent}/", "")
-    return {"file": inside.relative_to(place.parent).as_posix(), "problem": problem}
+    file = inside.relative_to(place.parent)
+    return {"file": file.as_posix(), "problem": problem, "remedy": error.remedy}
 
 
 # ------------------------------------------------------------------------------- the figures
@@ -309,8 +311,8 @@ def _write(
         board |= {"seal": table.dataset.seal, "methods": rows, "differences": of_two.rows}
         boards.append(board)
         for row in rows:
-            badge = _badge(row, len(rows), protocol["id"])
-            _text(site / "badges" / f"{row['submissions'][0]}.svg", badge)
+            with atomic_file(site / "badges" / f"{row['submissions'][0]}.svg") as file:
+                file.write_text(_badge(row, len(rows), protocol["id"]), encoding="utf-8")
         maps = [_error_maps(site, table, run) for runs in table.methods.values() for run in runs]
         count = in_number(len(table.pairs), "pair")
         too_few = [f"{count}: too few to tell methods apart, so that all of them have rank 1"]
@@ -319,8 +321,9 @@ def _write(
             (board, count, too_few, _ranking(rows, protocol), of_two.shown[0], sorted(maps))
         )
     every = {"software": f"stereotruth {__version__}", "confidence": CONFIDENCE, "boards": boards}
-    _text(site / "board.json", _json({**every, "refused": refused}))
-    _text(site / "papers_with_code.json", _json(_papers_with_code(settings.title, boards)))
+    told = [{key: of[key] for key in ("file", "problem")} for of in refused]
+    write_json(site / "board.json", {**every, "refused": told})
+    write_json(site / "papers_with_code.json", _papers_with_code(settings.title, boards))
     values = {
         "title": settings.title,
         "boards": shown,
@@ -331,15 +334,6 @@ def _write(
         "errors": Scale.of(ERRORS, "0", f"{ERROR_PX:g} px; blue: no disparity"),
     }
     write_page(site / "index.html", TEMPLATE, values)
-
-
-def _json(values: Any) -> str:
-    return json.dumps(values, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _text(file: Path, text: str) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _error_maps(site: Path, table: Table, run: Run) -> tuple[str, str, list[tuple[str, str]]]:

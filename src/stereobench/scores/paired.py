@@ -57,6 +57,13 @@ class Difference:
         """Whether the two are not told apart."""
         return self.low is None or self.high is None or self.low <= 0 <= self.high
 
+    @property
+    def said(self) -> str:
+        """What is known of the second."""
+        if self.low is None:
+            return "too few tiles to tell"
+        return "level" if self.level else "better" if self.value < 0 else "worse"
+
     def row(self, name: str) -> dict[str, float | None]:
         """For a table, by names that begin with that of the figure."""
         ends = {f"{name}_{end}": getattr(self, end) for end in ("low", "high", "better_share")}
@@ -166,12 +173,10 @@ def compare_folders(first: Sequence[Path], second: Sequence[Path]) -> list[str]:
             raise InputError(
                 f"{figure}: no tile in common", file=second[0], remedy="score on the same tiles"
             )
-        said = "level" if found.level else "better" if found.value < 0 else "worse"
-        said = "too few tiles to tell" if found.low is None else said
         numbers = [found.value, *([] if found.low is None else [found.low, found.high])]
         value, *ends = (minus(f"{v:+.4f}") for v in numbers)
         reach = f" [{', '.join(ends)}]" if ends else ""
-        lines.append(f"{figure}: {said}, {value}{reach}, {in_number(found.tiles, 'tile')}")
+        lines.append(f"{figure}: {found.said}, {value}{reach}, {in_number(found.tiles, 'tile')}")
     return lines
 
 
@@ -187,14 +192,17 @@ def differences(methods: Sequence[Row], folders: Sequence[Sequence[str | Path]])
     names = {"epe_px": "filled_epe_px", "d1_share": f"filled_d1_{limit:g}_px_share"}
     columns = {key: ("labelled", name) for key, name in names.items()}
     sums = [[read_sums(folder, columns) for folder in runs] for runs in folders]
-    rows = []
+    rows, told = [], []
     for a, b in combinations(range(len(methods)), 2):
         row: dict[str, Any] = {"method": methods[b]["label"], "less": methods[a]["label"]}
+        said = ""
         for key in names:
             found = difference(*([run[key] for run in sums[k]] for k in (a, b)))
             row |= {"tiles": found.tiles, **found.row(key)}
             row.setdefault("level", found.level)  # in EPE
+            said = said or found.said
         rows.append(row)
+        told.append({**row, "name": f"{row['method']} minus {row['less']}", "said": said})
     better = "better on (% of tiles)"
     figures = [
         Figure("EPE (px)", "epe_px", 1, "+.3f", interval=True),
@@ -202,19 +210,10 @@ def differences(methods: Sequence[Row], folders: Sequence[Sequence[str | Path]])
         Figure(f"D1, {limit:g} px (%)", "d1_share", 100, "+.2f", interval=True),
         Figure(better, "d1_share_better_share", 100, ".0f"),
     ]
-    named = [{"name": f"{row['method']} minus {row['less']}", **row} for row in rows]
     caption = (
         f"Difference of {FILLED}, with {CONFIDENCE:.0%} confidence from the differences by tile: "
         "negative where the first of the two is better, level where the interval holds 0. Fewer "
         f"than {MIN_TILES} tiles have no interval and tell nothing apart."
     )
-    told = [{**row, "said": _in_words(row)} for row in named]
     shown = of_figures(told, {"name": "Methods"}, figures, {"said": "in EPE"})
     return Table("differences", title, rows, [(caption, shown)])
-
-
-def _in_words(row: Row) -> str:
-    """Whether a difference in EPE is more than chance."""
-    if row["epe_px_low"] is None:
-        return "too few tiles"
-    return "level" if row["level"] else "told apart"

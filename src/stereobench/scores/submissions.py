@@ -19,12 +19,7 @@ from typing import Any
 import numpy as np
 
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.files import (
-    is_foreign,
-    plain_name,
-    read_table,
-    write_table,
-)
+from stereotruth.core.products.files import is_foreign, plain_name, read_table
 from stereotruth.core.products.provenance import file_sha256
 from stereotruth.core.products.rasters import image_shape, open_raster
 from stereotruth.tiles.stereo_dataset import Pair, StereoDataset
@@ -168,18 +163,6 @@ def read_admitted(folder: Path) -> dict[str, str]:
         raise InputError(
             "no list of submissions", file=file, remedy="columns are folder and sha256"
         ) from None
-
-
-def offered(folder: Path, names: Iterable[str], known: Mapping[str, str]) -> dict[str, str]:
-    """Checksums of ``submission.json`` of folders that have not been admitted."""
-    files = {name: folder / "submissions" / name / FILE for name in names if name not in known}
-    return {name: file_sha256(file) for name, file in files.items() if file.is_file()}
-
-
-def write_admitted(folder: Path, admitted: Mapping[str, str]) -> None:
-    """Write the list that :func:`read_admitted` reads."""
-    rows = [{"folder": name, "sha256": sha256} for name, sha256 in admitted.items()]
-    write_table(folder / ADMITTED, rows, ("folder", "sha256"))
 
 
 def refuse_borrowed(

@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 URL = re.compile(r"\b([A-Za-z][A-Za-z0-9+.-]*:/+)([^\s'\"<>]+)")
@@ -63,6 +64,16 @@ def install_extra(extra: str) -> str:
         f"install the extra {extra}: pip install '.[{extra}]' in a checkout, "
         f"pip install './stereotruth-VERSION-py3-none-any.whl[{extra}]' beside the wheel"
     )
+
+
+def require_packages(asked: str, packages: Iterable[str], extra: str) -> None:
+    """Raise InputError if a package that ``asked`` needs, of an extra, is not installed."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise InputError(
+                f"{asked} needs {package}, which is not installed",
+                remedy=f"{install_extra(extra)}; or leave it out",
+            )
 
 
 class InputError(ValueError):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.kernels import inner, kernel
 from ..core.numerics.arrays import Floats
-from ..core.numerics.geometry import DEGREE_M
+from ..core.numerics.geometry import DEGREE_M, turn
 from ..sensor.rpc import project_point
 from .model import EpipolarModel, inverse_point
 
@@ -158,7 +158,7 @@ def with_ground(grid: xr.Dataset) -> xr.Dataset:
     the CF conventions. All of the window is read: take a part of a large grid by ``isel`` or
     ``sel`` first. Raises InputError for a grid without heights or model.
     """
-    import pyproj  # which no other caller of this module needs
+    import pyproj  # which few callers of this module need
 
     for name, there in (("height", grid), ("epipolar", grid.attrs)):
         if name not in there:
@@ -181,13 +181,21 @@ def with_ground(grid: xr.Dataset) -> xr.Dataset:
     return found
 
 
+def utm_epsg(lon: float, lat: float) -> int:
+    """EPSG code of the zone of UTM on WGS 84 in which a place lies, degrees."""
+    return (32600 if lat >= 0 else 32700) + int((float(turn(lon)) + 180.0) // 6.0) + 1
+
+
 def coarse_place(model: EpipolarModel, view: str = "left") -> dict[str, Any]:
     """Attributes of GeoZarr by which maps show the grid of a view, which lies on no map's plane.
 
     The place is the affine function of the pixels that comes nearest to what they see at the
-    model's reference height, in degrees; ``place`` says how far off it is there and over all
-    heights of the model. Exact places are those of :func:`with_ground`.
+    model's reference height, in metres of UTM: in degrees its terms are so small that rioxarray
+    takes them for none. ``place`` says how far off it is there and over all heights of the model.
+    Exact places are those of :func:`with_ground`.
     """
+    import pyproj
+
     rows, cols = model.shape
     axes = np.linspace(0.0, cols - 1.0, PLACES), np.linspace(0.0, rows - 1.0, PLACES)
     x, y = (grid.ravel() for grid in np.meshgrid(*axes))
@@ -198,13 +206,16 @@ def coarse_place(model: EpipolarModel, view: str = "left") -> dict[str, Any]:
     if known.sum() < 3:
         return {}
     design = np.column_stack([x + 0.5, y + 0.5, np.ones(x.size)])[known]  # from the grid's corner
-    fit = np.linalg.lstsq(design, ground[0][:, known].T)[0]
-    metres = DEGREE_M * np.array([[np.cos(np.radians(fit[2, 1]))], [1.0]])
-    off = np.linalg.norm((ground[:, :, known] - (design @ fit).T) * metres, axis=1).max(axis=1)
+    ground = ground[:, :, known]
+    code = f"EPSG:{utm_epsg(*ground[0].mean(axis=1))}"
+    to_map = pyproj.Transformer.from_crs("EPSG:4326", code, always_xy=True)
+    ground = np.stack([to_map.transform(*places) for places in ground])
+    fit = np.linalg.lstsq(design, ground[0].T)[0]
+    off = np.linalg.norm(ground - (design @ fit).T, axis=1).max(axis=1)
     corners = np.array([[0, 0, 1], [cols, 0, 1], [0, rows, 1], [cols, rows, 1]]) @ fit
     return {
         "zarr_conventions": GEOZARR,
-        "proj:code": "EPSG:4326",
+        "proj:code": code,
         "spatial:dimensions": ["y", "x"],
         "spatial:transform": fit.T.ravel().tolist(),
         "spatial:bbox": [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()],

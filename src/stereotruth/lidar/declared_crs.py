@@ -10,6 +10,7 @@ import re
 import struct
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     import rasterio  # which few files need
 
 VERTICAL_UNITS_KEY = 4099
+PLAN_KEYS = (2048, 3072)  # of a geographic or a projected system
 LINEAR_UNITS = {  # EPSG code: (name, metres)
     9001: ("metre", 1.0),
     9002: ("foot", 0.3048),
@@ -253,6 +255,18 @@ def _geokeys_tiff(shorts: np.ndarray, doubles: bytes, text: bytes) -> bytes:
     return b"II*\0" + struct.pack("<IH", 8, len(entries)) + directory + bytes(4) + data
 
 
+def _compound_in_plan(keys: np.ndarray) -> CRS | None:
+    """The compound system whose code stands in a key for the system in plan; None without one.
+
+    laspy 2.7 writes it there (``add_crs``). GDAL 3.10 and 3.12 take its feet for metres.
+    """
+    codes = [value for key, at, _, value in keys.tolist() if key in PLAN_KEYS and at == 0]
+    with suppress(CRSError):  # no code of EPSG, or newer than PROJ's register
+        if codes and (system := CRS.from_epsg(codes[-1])).is_compound:
+            return system
+    return None
+
+
 def _from_geokeys(data: bytes, doubles: bytes, text: bytes) -> LidarCRS | None:
     """The system of GeoKeys (records 34735, 34736 and 34737), None if they name none.
 
@@ -285,7 +299,7 @@ def _from_geokeys(data: bytes, doubles: bytes, text: bytes) -> LidarCRS | None:
                 wkt, epoch = tiff.crs.to_wkt(), epoch_of(tiff)
     except RasterioError as error:
         raise ValueError(str(error)) from error
-    meaning = replace(interpret(CRS.from_wkt(wkt)), epoch=epoch)
+    meaning = replace(interpret(_compound_in_plan(keys) or CRS.from_wkt(wkt)), epoch=epoch)
     for key, location, _, value in keys.tolist():
         if key == VERTICAL_UNITS_KEY and location == 0 and value in LINEAR_UNITS:
             name, metres = LINEAR_UNITS[value]

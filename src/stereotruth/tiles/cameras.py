@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from ..core.numerics.arrays import Floats
 from ..core.numerics.geometry import for_readers
+from ..epipolar.intersection import utm_epsg
 from ..sensor.deliveries import Acquisition
 from ..sensor.rpc import RPC, SCALARS, VECTORS
 
@@ -121,8 +122,7 @@ def eogs_models(crops: Sequence[Crop], records: Sequence[Mapping[str, Any]]) -> 
     ``coef_`` @ world + ``intercept_``. ``max_error_px``: the largest difference from the RPC.
     """
     lon, lat = records[0]["geojson"]["center"]
-    zone = min(int((lon + 180.0) // 6.0), 59) + 1
-    utm = Transformer.from_crs(4326, (32700 if lat < 0 else 32600) + zone, always_xy=True)
+    utm = Transformer.from_crs(4326, code := utm_epsg(lon, lat), always_xy=True)
 
     def places(crop: Crop, on: Floats) -> tuple[Floats, Floats]:
         pixels, ground = crop.points(on)
@@ -133,7 +133,7 @@ def eogs_models(crops: Sequence[Crop], records: Sequence[Mapping[str, Any]]) -> 
     scale = float(np.linalg.norm(corners - center, axis=1).max())
     world = {
         "scale": scale,
-        "n": zone,
+        "n": code % 100,
         "l": BANDS[int((lat + 80.0) // 8.0)],
         "center": center.tolist(),
         "min_world": ((corners.min(axis=0) - center) / scale).tolist(),

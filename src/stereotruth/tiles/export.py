@@ -32,10 +32,9 @@ from ..core.config.configuration import Export
 from ..core.errors import InputError
 from ..core.job import progress
 from ..core.products.files import atomic_file, atomic_folder, growing_table, write_table
-from ..core.products.provenance import describe, file_sha256, own_digest, source_digest
+from ..core.products.provenance import describe, source_digest
 from .label_doubts import Doubt, doubts, flag, missed
-from .manifest import FOOTPRINTS, NONE, STATUS_COLOURS_FILE, column
-from .orientation import save
+from .manifest import NONE, STATUS_COLOURS_FILE, column
 from .quick_looks import (
     draw_contact_sheet,
     draw_coverage,
@@ -59,11 +58,13 @@ from .tile_checks import (
     CHECK_COLUMNS,
     SceneChecks,
     TileChecks,
+    flagged,
     in_counts,
     sigma_by_surface,
     summarise,
 )
 from .tile_files import FILES, RIGHT_FILES, City, Cut, write_tile
+from .verify import write_export
 
 log = logging.getLogger("stereotruth")
 
@@ -194,12 +195,7 @@ def export_city(
         for kind in windows.kinds(settings.layers):
             (scratch / kind).mkdir(parents=True)
         summary, rows = _write_tiles(scratch, windows, cut, beside, parameters, workers)
-        record = summary | {
-            "manifest_sha256": file_sha256(scratch / "manifest.csv"),
-            "footprints_sha256": file_sha256(scratch / FOOTPRINTS),
-            "provenance": cut.provenance,
-        }
-        save(scratch / "export.json", record | {"digest": own_digest(record)})
+        write_export(scratch, summary, cut.provenance)
         _forget_others(cut, rows)
     return summary
 
@@ -403,5 +399,5 @@ def _gates(
             for scene, of in scenes.items()
         },
         "doubts": {s: [d.to_dict() for d in of] for s, of in in_doubt.items() if of},
-        "flagged_tiles": {r["tile"]: r["quality"] for r in labelled if r["quality"] != "ok"},
+        "flagged_tiles": flagged(labelled),
     }

@@ -18,9 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, install_extra
+from ..core.config.configuration import NEEDED
+from ..core.errors import InputError, require_packages
 from ..core.job import progress
-from ..core.products.files import atomic_folder, write_table
+from ..core.products.files import atomic_folder, read_json, read_record, write_table
 from ..core.products.provenance import file_sha256
 from ..core.products.rasters import (
     KITTI_STEPS,
@@ -144,15 +145,9 @@ def assemble_dataset(
         shared = shared_ground(*(folder / "manifest.csv" for folder in folders))
         for a, b in shared:
             log.warning("%s and %s share ground and are in different splits", a, b)
-        footprints = dict(_footprints(folders, rows))
-        write_footprints(scratch, footprints.values())
-        if rows and "stac" in catalogs:
-            where = {row["tile"]: at / row["orientation"] for at, row, *_ in todo}
-            _catalogs("stac").write_stac(scratch, rows, where, footprints, acquired or {}, licence)
-        if rows:
-            write_table(scratch / "manifest.csv", rows)
-        if rows and "croissant" in catalogs:
-            _catalogs("croissant").write_croissant(scratch, licence)
+        where = {row["tile"]: at / row["orientation"] for at, row, *_ in todo}
+        told = {"catalogs": catalogs, "acquired": acquired or {}, "licence": licence}
+        write_tables(scratch, rows, dict(_footprints(folders, rows)), where, **told)
         labelled = (row for _, row, _, kinds in todo if "disp" in kinds)
         largest = max((float(row["disparity_rounding_px"]) for row in labelled), default=0.0)
         text = README.format(
@@ -168,15 +163,53 @@ def assemble_dataset(
     return {"pairs": dict(counts), "shared_ground": shared}
 
 
+def write_tables(
+    folder: Path,
+    rows: Sequence[dict[str, Any]],
+    footprints: Mapping[str, Mapping[str, Any]],
+    orientations: Mapping[str, Path],
+    *,
+    catalogs: Sequence[str],
+    acquired: Mapping[str, str],
+    licence: str,
+) -> None:
+    """Write all that tells of the pairs in ``folder``: footprints, catalogs, manifest of ``rows``.
+
+    ``footprints`` and ``orientations`` by tile; the rest as in :func:`assemble_dataset`.
+    """
+    if footprints:
+        write_footprints(folder, footprints.values())
+    if rows and "stac" in catalogs:
+        stac = _catalogs("stac")
+        stac.write_stac(folder, rows, orientations, footprints, acquired, licence)
+    if rows:
+        write_table(folder / "manifest.csv", rows)
+    if rows and "croissant" in catalogs:
+        _catalogs("croissant").write_croissant(folder, licence)
+
+
+def catalogs_of(dataset: Path, rows: Iterable[Mapping[str, str]]) -> dict[str, Any]:
+    """Catalogs, dates and licence that :func:`write_tables` was given for a dataset."""
+    files = {"stac": dataset / "stac/collection.json", "croissant": dataset / "croissant.json"}
+    how = {"what": "catalog", "stage": "dataset", "read": read_json}
+    licences = {
+        name: read_record(file, lambda of: of["license"], **how)
+        for name, file in files.items()
+        if file.is_file()
+    }
+    acquired = {}
+    for row in rows if "stac" in licences else ():
+        when = read_record(dataset / row["item"], lambda of: of["properties"]["datetime"], **how)
+        acquired |= {row["scene"]: when} if when else {}
+    licence = next(iter(licences.values()), "other")
+    return {"catalogs": list(licences), "acquired": acquired, "licence": licence}
+
+
 def _catalogs(wanted: str) -> ModuleType:
     """The module that writes catalogs, with libraries that not everyone needs."""
-    try:
-        from . import catalogs
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"dataset.catalogs: {wanted} needs {error.name}, which is not installed",
-            remedy=f"{install_extra('catalog')}; or leave it out",
-        ) from None
+    require_packages(f"dataset: {wanted}", NEEDED[wanted], "catalog")
+    from . import catalogs
+
     return catalogs
 
 

@@ -20,7 +20,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, install_extra
+from ..core.config.configuration import NEEDED
+from ..core.errors import InputError, require_packages
 from ..core.products.provenance import file_sha256
 from ..pages import pictures
 from .manifest import SPLITS
@@ -137,12 +138,9 @@ def _shard(path: Path, samples: Sequence[Sample]) -> None:
 
 def _parquet(path: Path, samples: Sequence[Sample]) -> None:
     """A file with a line for each sample; arrays are lists of lists."""
-    try:
-        import pyarrow as pa
-        from pyarrow import parquet
-    except ModuleNotFoundError as error:
-        problem = f"dataset.layouts: parquet needs {error.name}, which is not installed"
-        raise InputError(problem, remedy=install_extra("catalog")) from None
+    require_packages("dataset: parquet", NEEDED["parquet"], "catalog")
+    import pyarrow as pa
+    from pyarrow import parquet
 
     def nested(array: NDArray[Any]) -> pa.Array:
         found = pa.array(array.reshape(-1))

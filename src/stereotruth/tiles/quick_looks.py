@@ -32,6 +32,7 @@ from ..core.errors import in_number
 from ..core.numerics.arrays import Floats
 from ..core.products.rasters import read_disparity, read_image
 from ..core.status import BY_LABEL
+from ..epipolar.intersection import utm_epsg
 from ..pages import pictures
 from ..pages.pictures import colours, save_figure
 from .manifest import FOOTPRINTS, STYLE
@@ -190,8 +191,7 @@ def write_ground_looks(folder: Path, source: SceneStores) -> list[Path]:
         return []
     y, x = (index[known] * float(scale) for index in np.indices(height.shape))
     lon, lat = source.model.epipolar_to_ground(x, y, height[known].astype(np.float64))
-    zone = min(int((float(np.mean(lon)) + 180.0) // 6.0) + 1, 60)
-    crs = pyproj.CRS.from_epsg((32600 if np.mean(lat) >= 0 else 32700) + zone)  # UTM
+    crs = pyproj.CRS.from_epsg(utm_epsg(float(np.mean(lon)), float(np.mean(lat))))
     to_map = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
     east, north = to_map.transform(lon, lat)
     surface, origin, step = _heights(east, north, height[known], _spacing(known, east, north))

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Any
 from ..core.errors import InputError, in_number
 from ..core.products.files import (
     atomic_folder,
+    copy,
     path_below,
     read_record,
     refuse_others,
@@ -97,7 +97,7 @@ def seal_dataset(root: str | Path, pairs: Iterable[Any], split: str, to: str | P
         refuse_changed(root)
     with atomic_folder(to) as scratch:
         for file in (*kept, *(filter(Path.is_file, [root / README]))):
-            _copy(file, scratch / file.relative_to(root))
+            copy(file, scratch / file.relative_to(root))
         if has_manifest:
             rows = read_manifest(root)
             told = [
@@ -139,10 +139,5 @@ def open_seal(root: str | Path, labels: str | Path) -> str:
                 remedy="give the dataset that was sealed",
             )
     for name in sorted(seal.files, key=lambda name: name == MANIFEST):  # which names the others
-        _copy(labels / name, root / name)
+        copy(labels / name, root / name)
     return f"{root}: {in_number(len(seal.files), 'file')} opened, all as seal {seal.id} has them"
-
-
-def _copy(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(source, target)

@@ -23,14 +23,13 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, in_number, install_extra
+from ..core.errors import InputError, in_number, require_packages
 from ..core.products.files import files_below, plain_name, read_sealed
 from ..core.products.provenance import file_sha256
 from ..core.products.rasters import read_disparity, read_image, read_labels
@@ -195,8 +194,7 @@ class StereoTiles:
         layout: str = "stereotruth",
         nodata: float = -999.0,
     ) -> None:
-        if find_spec("torch") is None:
-            raise InputError("StereoTiles needs PyTorch", remedy=install_extra("networks"))
+        require_packages("StereoTiles", ["torch"], "networks")
         self.dataset = StereoDataset(Path(root).name, root, layout, (-(2**15), 2**15), nodata)
         self.pairs = self.dataset.pairs(split, labelled=True)
         self.transforms = transforms

@@ -212,6 +212,18 @@ def in_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 
+def reach_of(labelled: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Least and greatest disparity of rows of a manifest that have labels."""
+    ends = [(row["disparity_min_px"], row["disparity_max_px"]) for row in labelled]
+    low, high = zip(*((float(a), float(b)) for a, b in ends if a))
+    return {"min": min(low), "max": max(high)}
+
+
+def flagged(labelled: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """The gates that tiles miss, of rows of a manifest that have labels."""
+    return {row["tile"]: row["quality"] for row in labelled if row["quality"] != "ok"}
+
+
 def summarise(
     city: str,
     rows: Sequence[Mapping[str, Any]],
@@ -240,10 +252,7 @@ def summarise(
             for scene, outcome in outcomes.items()
         },
         "share_of_pixels": {name: round(share, 6) for name, share in status.items()},
-        "disparity_px": {
-            "min": min(float(row["disparity_min_px"]) for row in labelled),
-            "max": max(float(row["disparity_max_px"]) for row in labelled),
-        },
+        "disparity_px": reach_of(labelled),
         "disparity_rounding": {
             "largest_px": largest,
             "meaning": (

@@ -283,7 +283,10 @@ def _finished(
         for name, values in layers.items():
             kind, path = KINDS[name], paths[column(name)]
             write_tiff(path, values, nodata=kind.nodata, description=kind.description)
-        checks = None if known is None else _check(crop, known)
+        checks = None
+        if known is not None:
+            stored = np.where(np.isfinite(crop.disparity), crop.stored.astype(np.float64), np.nan)
+            checks = check_labels(crop.left, crop.right, stored, known)
         piece = cut.ledger.put(tile, key, paths, None if checks is None else checks.to_dict())
     found = piece.result
     return dict(piece.sha256), None if found is None else TileChecks.from_dict(found)
@@ -395,10 +398,13 @@ def _write_labels(path: Path, disparity: NDArray[np.float32], *, nodata: float, 
     )
 
 
-def _check(crop: _Crop, known: LabelsKnown) -> TileChecks:
-    """Hold the labels of a tile, as stored, against its images."""
-    left, right = crop.left, crop.right
-    disparity = np.where(np.isfinite(crop.disparity), crop.stored.astype(np.float64), np.nan)
+def check_labels(
+    left: NDArray[np.uint16],
+    right: NDArray[np.uint16],
+    disparity: NDArray[np.float64],
+    known: LabelsKnown,
+) -> TileChecks:
+    """Hold the labels of a tile (px, as stored, NaN where there is none) against its images."""
     x = np.arange(left.shape[1])[None, :] - disparity
     matches = match_tile(left, right, disparity, known.surface_class)
     labelled = np.isfinite(disparity)

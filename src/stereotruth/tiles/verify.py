@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 from ..core.errors import InputError
 from ..core.products.files import is_foreign, read_json
 from ..core.products.provenance import file_sha256, own_digest
 from .manifest import FOOTPRINTS, STATUS_COLOURS_FILE, STYLE, listed_files
+from .orientation import save
 
 log = logging.getLogger("stereotruth")
 
@@ -21,6 +23,14 @@ LOOSE = (
     *("README.md", "croissant.json", "stac/collection.json", "stac/rpc/*"),
     *("satnerf/pts3d.npy", "colmap/frame.json", "colmap/sparse/0/*.txt"),
 )
+SUMS = {"manifest_sha256": "manifest.csv", "footprints_sha256": FOOTPRINTS}  # in export.json
+
+
+def write_export(folder: Path, record: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
+    """Write the ``export.json`` of a folder whose manifest and footprints are written."""
+    sums = {key: file_sha256(folder / name) for key, name in SUMS.items()}
+    record = {**record, **sums, "provenance": provenance}
+    save(folder / "export.json", record | {"digest": own_digest(record)})
 
 
 def defects(folder: str | Path) -> list[str]:
@@ -58,7 +68,7 @@ def defects(folder: str | Path) -> list[str]:
             said = {}
         if said.get("digest") != own_digest(said):
             found.append("export.json: changed")
-        for name, key in (("manifest.csv", "manifest_sha256"), (FOOTPRINTS, "footprints_sha256")):
+        for key, name in SUMS.items():
             if not (folder / name).is_file():
                 found.append(f"{name}: missing")
             elif file_sha256(folder / name) != said.get(key):

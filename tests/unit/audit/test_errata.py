@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -19,14 +20,20 @@ from stereobench.audit.errata import (
 )
 from stereobench.audit.pair import estimate, measure
 from stereobench.audit.verdicts import Audited, judge
+from stereotruth.core.config.configuration import Limits
 from stereotruth.core.config.methods import Audit
 from stereotruth.core.errors import InputError
-from stereotruth.core.products.files import read_table, sealed, write_table
+from stereotruth.core.products.files import sealed, write_table
 from stereotruth.core.products.provenance import file_sha256
 from stereotruth.core.products.rasters import read_disparity, write_tiff
-from stereotruth.tiles.stereo_dataset import StereoDataset
+from stereotruth.tiles.layouts import assemble_dataset
+from stereotruth.tiles.seals import seal_dataset
+from stereotruth.tiles.stereo_dataset import StereoDataset, find_pairs
+from stereotruth.tiles.tile_checks import SIGMA_COLUMNS
+from stereotruth.tiles.verify import defects, write_export
 
 from ...synthetic.pair_with_block import SIZE, make
+from ...synthetic.tiled_scene import make_scene, rows_of, run
 
 PUBLISHED = Path(__file__).parents[4] / "shared/published/us3d"
 LIMITS = Audit(contradicted_share=0.05, hidden_share=0.01, worst=0)
@@ -187,32 +194,80 @@ def download(tmp_path):
 
 def test_a_download_is_copied_with_its_labels_corrected(download, tmp_path):
     root, file = download
-    row = {"disp": "test/disp/KM_disparity_1.tiff", "disp_sha256": file_sha256(file)}
-    row |= {"labelled_share": "0.981481", "disparity_min_px": "3.2500", "quality": "ok"}
-    row |= {"tile": "KM_1"}
-    place = {"id": "KM_1", "properties": {"disparity_min_px": 3.25, "split": "test"}}
-    (root / "footprints.geojson").write_text(json.dumps({"features": [place]}))
-    write_table(root / "manifest.csv", [row])
     before = file.read_bytes()
     mask = np.zeros((6, 9), np.uint8)
     mask[5, 8] = 2
     correction = Correction(2.0, 0.0, 1.0, [[0.5, 1.5], [0.5, 1.5]], [[0.1, 0.1], [0.1, 0.1]])
     delta, out = written(tmp_path / "delta", file, correction, mask), tmp_path / "out"
     assert apply_errata(delta, root, out) == 1
-    found = read_disparity(out / row["disp"])
+    found = read_disparity(out / file.relative_to(root))
     np.testing.assert_allclose(found[1], 4.5 + np.linspace(0.5, 1.5, 9), atol=1e-6)
     assert np.isnan(found[0, 0]) and np.isnan(found[5, 8]) and np.isfinite(found).sum() == 52
     assert file.read_bytes() == before
     for name in ("left/KM_left_1.tiff", "right/KM_right_1.tiff"):
         assert (out / "test" / name).read_bytes() == (root / "test" / name).read_bytes()
-    (renewed,) = read_table(out / "manifest.csv")
-    assert renewed == row | {
-        "disp_sha256": file_sha256(out / row["disp"]),
-        "labelled_share": f"{52 / 54:.6f}",
-        "disparity_min_px": "5.0000",
-    }
-    (place,) = json.loads((out / "footprints.geojson").read_text())["features"]
-    assert place["properties"]["disparity_min_px"] == 5.0 and place["properties"]["split"] == "test"
+
+
+@pytest.fixture(scope="module")
+def tiles(tmp_path_factory):
+    """A city's tiles whose labels of one tile are 3 px off, and what they were."""
+    top = tmp_path_factory.mktemp("tiles")
+    right = top / "right/Town"
+    run([make_scene(top / "s1", bare_from=240)], right, quality=Limits())
+    rows = rows_of(right)
+    row = next(row for row in rows if row["split"] == "test")
+    shutil.copytree(right, wrong := top / "wrong/Town")
+    labels = read_disparity(right / row["disp"], -999)
+    write_tiff(wrong / row["disp"], np.where(np.isnan(labels), -999, labels + 3), nodata=-999)
+    row |= {"disp_sha256": file_sha256(wrong / row["disp"])}
+    write_table(wrong / "manifest.csv", rows)
+    record = json.loads((wrong / "export.json").read_text())
+    write_export(wrong, record, record["provenance"])
+    return right, wrong, row
+
+
+@pytest.mark.parametrize("kind", ["tiles", "dataset"])
+def test_what_a_copy_states_of_its_labels_is_that_of_its_files(kind, tiles, tmp_path):
+    """After errata that take 3 px away, it is what was stated of the labels that were right."""
+    right, wrong, row = tiles
+    if kind == "dataset":
+        how = {"catalogs": ["stac", "croissant"], "acquired": {row["scene"]: "2020-10-25"}}
+        for name in ("stac", "croissant"):
+            pytest.importorskip({"stac": "pystac", "croissant": "mlcroissant"}[name])
+        for folder, out in ((right, tmp_path / "good"), (wrong, tmp_path / "bad")):
+            assemble_dataset([folder], out, licence="cc-by-4.0", **how)
+        right, wrong = tmp_path / "good", tmp_path / "bad"
+        seal_dataset(wrong, find_pairs(wrong, "stereotruth"), "test", tmp_path / "sealed")
+        shutil.copyfile(tmp_path / "sealed/seal.json", wrong / "seal.json")
+    (row,) = (of for of in rows_of(wrong) if of["tile"] == row["tile"])
+    shift = Correction(field_px=[[-3.0]], sigma_px=[[0.1]])
+    delta, out = written(tmp_path / "delta", wrong / row["disp"], shift), tmp_path / "out"
+    assert apply_errata(delta, wrong, out) == 1
+    assert defects(out) == [] and not (out / "seal.json").exists()
+    dataset = StereoDataset("mine", out, "stereotruth", (-64, 64))
+    assert not [*dataset.pairs()[0].changed()]
+    unknown = {*SIGMA_COLUMNS, "doubt", "disp_sha256", "item_sha256"}
+    for is_, was in zip(rows_of(out), rows_of(right)):
+        there = {key for key in was if is_[key] != was[key]}
+        assert there <= (unknown if was["tile"] == row["tile"] else {"doubt"})
+    for file in ("footprints.geojson", f"stac/{row['tile']}/{row['tile']}.json"):
+        if (right / file).is_file():
+            is_, was = (json.loads((folder / file).read_text()) for folder in (out, right))
+            if "assets" in is_:
+                assets = [of["assets"].pop("disparity") for of in (is_, was)]
+                sum_of_file = "1220" + file_sha256(out / row["disp"])
+                assert assets[0]["file:checksum"] == sum_of_file
+                assert assets[0]["file:size"] == (out / row["disp"]).stat().st_size
+            assert is_ == was
+    if kind == "dataset":
+        said = json.loads((out / "croissant.json").read_text())
+        (manifest,) = (of for of in said["distribution"] if "sha256" in of)
+        assert manifest["sha256"] == file_sha256(out / "manifest.csv")
+        assert said["license"] == json.loads((right / "croissant.json").read_text())["license"]
+    else:
+        is_, was = (json.loads((folder / "export.json").read_text()) for folder in (out, right))
+        assert is_["disparity_px"] == was["disparity_px"] and "label_uncertainty" not in is_
+        assert is_["quality"]["flagged_tiles"] == was["quality"]["flagged_tiles"]
 
 
 def test_kitti_files_stay_such(tmp_path):

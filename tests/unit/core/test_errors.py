@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 from rasterio.errors import RasterioIOError
 
-from stereotruth.core.errors import InputError, in_words, told_by_system, without_secrets
+from stereotruth.core.errors import (
+    InputError,
+    in_words,
+    require_packages,
+    told_by_system,
+    without_secrets,
+)
 
 SECRET = "hunter2"
 URLS = (
@@ -68,3 +74,10 @@ def test_a_function_tells_in_words():
 
     with pytest.raises(InputError, match=r"scenes\.tsv"):
         read()
+
+
+def test_a_missing_package_is_named_with_its_extra():
+    require_packages("dataset: parquet", ["numpy"], "catalog")
+    with pytest.raises(InputError) as refused:
+        require_packages("dataset: parquet", ["numpy", "no_such_package"], "catalog")
+    assert "no_such_package" in refused.value.problem and "catalog" in refused.value.remedy

@@ -94,6 +94,9 @@ METRE, FOOT, SURVEY_FOOT = 9001, 9002, 9003
         ([(3072, 26910), (4096, 32767), (4099, FOOT)], 1.0, None, False, FT),
         ([(3072, 32610), (4096, 5030), (4099, METRE)], 1.0, None, True, 1.0),
         ([(1024, 2), (2048, 4979)], None, None, True, 1.0),
+        # compound systems as laspy writes them, of which GDAL takes feet for metres
+        ([(3072, 8729)], US_FT, "NAVD88 height (ftUS)", False, US_FT),
+        ([(1024, 2), (2048, 9518)], None, "EGM2008 height", False, 1.0),
     ],
 )
 def test_geokeys_say_the_same(keys, horizontal_unit, datum, ellipsoidal, height_unit) -> None:

@@ -189,6 +189,12 @@ class Tiles(Section):
     truth of `dataset_us3d/`"""
 
 
+NEEDED = {  # packages of the extra ``catalog``
+    **dict.fromkeys(("stac", "croissant"), ("pystac", "mlcroissant")),
+    "parquet": ("pyarrow",),
+}
+
+
 class Dataset(Section):
     """The configuration's section dataset."""
 

@@ -108,7 +108,13 @@ def link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:
-        shutil.copyfile(source, target)
+        copy(source, target)
+
+
+def copy(source: Path, target: Path) -> None:
+    """A copy of a file in a folder that is made if it is not there."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
 
 
 def as_text(value: Any) -> Any:
@@ -172,7 +178,7 @@ def read_table(path: str | Path) -> Iterator[dict[str, str]]:
             yield {key: of_text(cell) for key, cell in row.items()}
 
 
-def write_json(path: str | Path, values: Mapping[str, Any]) -> None:
+def write_json(path: str | Path, values: Mapping[str, Any] | list[Any]) -> None:
     """A JSON file, whole or absent."""
     with atomic_file(path) as scratch:
         scratch.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
