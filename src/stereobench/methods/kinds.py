@@ -184,8 +184,8 @@ def _program(settings: Mapping[str, Any]) -> list[Path]:
     if "{" not in str(words[0]) and shutil.which(words[0]) is None:
         raise InputError(
             f"no program {str(words[0])!r} that this machine can run",
-            remedy="install it, or write its path as the first word of command; a program that only "
-            "the nodes of a cluster have is called from a script: command: sh mine.sh {left} …",
+            remedy="install it, or write its path as the first word of command; one that only the "
+            "nodes of a cluster have is called from a script: command: sh mine.sh {left} …",
         )
     return sorted({*filter(Path.is_file, words), *map(Path, settings.get("files") or ())})
 
