@@ -186,7 +186,8 @@ def _program(settings: Mapping[str, Any]) -> list[Path]:
     if "{" not in words[0] and shutil.which(words[0]) is None:
         raise InputError(
             f"no program {words[0]!r} that this machine can run",
-            remedy="install it, or write its path as the first word of command",
+            remedy="install it, or write its path as the first word of command; one that only the "
+            "nodes of a cluster have is called from a script: command: sh mine.sh {left} …",
         )
     files = filter(Path.is_file, map(Path, words))
     return sorted({*files, *map(Path, settings.get("files") or ())})
