@@ -173,7 +173,7 @@ def _off_by_rpcs(files: Sequence[SurveyedFile], alignment: Alignment, undulation
         spare = (high - low) / 4
         if high - low > abs(undulation_m) or (bottom <= high + spare and top >= low - spare):
             return ""
-        if bottom - 2 * undulation_m > high or top - 2 * undulation_m < low:
+        if not (bottom - 2 * undulation_m <= high and low <= top - 2 * undulation_m):
             return ""
     return f"by the RPCs' heights of {low:.0f} to {high:.0f} m"
 
