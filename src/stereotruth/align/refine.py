@@ -357,7 +357,8 @@ def refine(
             raise InputError(
                 f"no alignment without ground control points: {'; '.join([result, *doubts])}{of}",
                 file=left_image,
-                remedy="measure GCPs, and check that LiDAR and images show the same ground",
+                remedy="check that each of the two images has its own RPC, and that the LiDAR shows "
+                "their ground; else measure GCPs",
             )
         doubts = [f"not refined: {result}", *doubts]
         _warn(doubts, strict, left_image, of)

@@ -120,8 +120,8 @@ def draw_contact_sheet(
     for row in (labelled[k] for k in picked):
         images = (read_image(folder / row[kind]) for kind in ("left", "right"))
         grey = [pictures.stretch(pictures.shrink(image, 256)) for image in images]
-        step = max(1, row["size"] // 256)
-        disparity = read_disparity(folder / row["disp"], nodata)[::step, ::step]
+        picked_px = np.linspace(0, row["size"], len(grey[0]), endpoint=False).astype(int)
+        disparity = read_disparity(folder / row["disp"], nodata)[np.ix_(picked_px, picked_px)]
         tiles.append((row["tile"], *grey, disparity))
     values = np.concatenate([tile[3][np.isfinite(tile[3])] for tile in tiles])
     limits = tuple(float(v) for v in np.percentile(values, (1, 99)))

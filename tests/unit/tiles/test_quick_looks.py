@@ -15,9 +15,15 @@ from rasterio.transform import from_bounds
 
 from stereotruth.tiles.manifest import STYLE
 from stereotruth.tiles.orientation import evaluate
-from stereotruth.tiles.quick_looks import SPLIT_COLOURS, read_footprints, write_ground_looks
+from stereotruth.tiles.quick_looks import (
+    SPLIT_COLOURS,
+    draw_contact_sheet,
+    read_footprints,
+    write_ground_looks,
+)
 from stereotruth.tiles.scene_stores import open_stores
 
+from ...synthetic.images import write
 from ...synthetic.other_programs import PROGRAMS
 from ...synthetic.tiled_scene import labels, make_scene, rows_of, terrain, texture
 
@@ -70,6 +76,16 @@ def test_the_style_draws_each_split_in_its_colour(exported: tuple[Path, dict]) -
 
 
 # ------------------------------------------------------------------ on a map
+
+
+@pytest.mark.parametrize("size", [100, 288, 576])
+def test_a_contact_sheet_is_drawn_of_tiles_of_any_size(tmp_path, size) -> None:
+    for kind, dtype in (("left", "uint16"), ("right", "uint16"), ("disp", "float32")):
+        write(tmp_path / f"{kind}.tif", np.arange(size * size, dtype=dtype).reshape(size, size))
+    row = {"tile": "a", "complete": "yes", "size": size}
+    rows = [row | {kind: f"{kind}.tif" for kind in ("left", "right", "disp")}]
+    draw_contact_sheet(tmp_path / "sheet.png", "A", rows, tmp_path, -999.0)
+    assert (tmp_path / "sheet.png").stat().st_size > 10_000
 
 
 def test_a_quick_look_shows_what_is_there(tmp_path) -> None:

@@ -54,6 +54,7 @@ BASE64 = 3 / 4  # bytes of a picture per byte in the page
 SHARES = {"figures": 0.1, "thumbnails": 0.4, "sliders": 0.5}
 MOST_BYTES = {"figures": 600_000, "thumbnails": 24_000, "sliders": 200_000}  # of each picture
 COVERAGE_PX, FIGURE_PX, THUMBNAIL_PX, SLIDER_PX = 2200, 1400, 320, 900
+SAME_HEIGHT = 1.1  # of a px of disparity: the largest of the scenes to the least
 KINDS = ("left", "right", "disparity", "status")
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
 CHANGED, MISFIT = Status.CHANGED.label, "changed_(does_not_fit_the_images)"
@@ -131,7 +132,7 @@ def write_report(
         for of in (files.alignments, files.refinements)
     )
     sizes = _pixel_sizes(folder, labelled)
-    height = max((size.height_m for size in sizes.values()), default=None)
+    height = _common_height_m(sizes.values())
     since = {"since_last_run": _record(files.summary).get("since_last_run", {})}
     truth_rows = _rows(files.truth_table)
     figure_count = 2 + len(files.looks) + 2 * len(alignments)
@@ -154,7 +155,6 @@ def write_report(
         "index": way(out, index),
         "headlines": headlines(rows, alignments, refined, truth_rows, export | since, height),
         "sizes": sizes,
-        "height_m_per_px": height,
         "heights_of_10_px": _heights_of_10_px(sizes.values()),
         "links": files.links(out),
         "provenance": provenance(made_of),
@@ -293,6 +293,12 @@ def _pixel_sizes(folder: Path, labelled: Sequence[Row]) -> dict[str, PixelSize]:
         if size := PixelSize.mean([folder / row["orientation"] for row in here[:20:4]]):
             found[scene] = size
     return found
+
+
+def _common_height_m(sizes: Iterable[PixelSize]) -> float | None:
+    """Height in m of a px of disparity, the largest, where scenes have about the same."""
+    heights = sorted(size.height_m for size in sizes)
+    return heights[-1] if heights and heights[-1] < SAME_HEIGHT * heights[0] else None
 
 
 def _heights_of_10_px(sizes: Iterable[PixelSize]) -> str:

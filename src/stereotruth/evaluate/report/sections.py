@@ -224,7 +224,8 @@ def _gates(labelled: Rows, quality: Mapping[str, Any]) -> Headline:
         note = joined(note, f"images and labels disagree in {', '.join(doubted)}")
     if told:
         note = joined(note, f"alignment or LiDAR of {', '.join(told)} in doubt")
-    text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else "all met"
+    met = "met, with doubts" if doubted or told else "all met"
+    text = f"{bad} of {len(labelled)} tiles miss one" if bad or scenes else met
     return Headline("limits of quality", text, note, bool(bad or scenes or doubted or told))
 
 
