@@ -387,7 +387,7 @@ def _tell(folder: Path, dataset: Path, corrected: Collection[str], nodata: float
         for name in ("scenes", "surfaces", "doubts"):
             quality[name] = {key: of for key, of in quality[name].items() if key not in scenes}
         quality["flagged_tiles"] = flagged(labelled)
-        del record["label_uncertainty"]
+        record.pop("label_uncertainty", None)  # which a corrected copy has not
         write_export(folder, record | {"disparity_px": reach_of(labelled)}, record["provenance"])
 
 

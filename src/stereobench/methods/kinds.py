@@ -27,6 +27,8 @@ from typing import Any
 from stereotruth.core.config.section import PATTERN
 from stereotruth.core.errors import InputError, did_you_mean, install_extra
 
+# What gives a file names that it does not say.
+MAKES_NAMES = r"\bimport\s*\*|\b(?:globals|vars|exec|setattr|__getattr__)\b"
 IMPORTERS = ("import_module", "__import__", "spec_from_file_location", "run_path", "run_module")
 
 FOLDER = "folder"
@@ -154,10 +156,10 @@ def _require(attribute: str, file: Path) -> None:
 
     A file that is not there, that takes names of another, or makes some as it runs, may have it.
     """
-    text = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else "*"
-    if re.search(
-        rf"\b{attribute.partition('.')[0]}\b|\*$|\bglobals\b|\bexec\b", text, re.MULTILINE
-    ):
+    if not file.is_file():
+        return
+    text = file.read_text(encoding="utf-8", errors="replace")
+    if re.search(rf"\b{re.escape(attribute.partition('.')[0])}\b|{MAKES_NAMES}", text):
         return
     names = re.findall(r"^(?:async )?(?:def|class) (\w+)", text, re.MULTILINE)
     remedy = did_you_mean(attribute, names, "name a function of the file")
@@ -180,14 +182,15 @@ def words_of(command: str) -> list[str]:
 
 def _program(settings: Mapping[str, Any]) -> list[Path]:
     """The words of the command that are files, and what is named besides."""
-    words = [Path(word) for word in words_of(settings.get("command", ""))]
-    if "{" not in str(words[0]) and shutil.which(words[0]) is None:
+    words = words_of(settings.get("command", ""))
+    if "{" not in words[0] and shutil.which(words[0]) is None:
         raise InputError(
-            f"no program {str(words[0])!r} that this machine can run",
+            f"no program {words[0]!r} that this machine can run",
             remedy="install it, or write its path as the first word of command; one that only the "
             "nodes of a cluster have is called from a script: command: sh mine.sh {left} …",
         )
-    return sorted({*filter(Path.is_file, words), *map(Path, settings.get("files") or ())})
+    files = filter(Path.is_file, map(Path, words))
+    return sorted({*files, *map(Path, settings.get("files") or ())})
 
 
 def place_of(function: str) -> tuple[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -170,7 +170,12 @@ def add_scene(
     city = city or re.sub(r"[^A-Za-z0-9-]+", "-", folder.name).strip("-") or "City"
     if len(images) > 2:
         given = {"lidar": lidar, "lidar-crs": lidar_crs, "geoid": geoid, "gcps": gcps}
-        return lines + _add_site(images, city, settings, given)
+        then = ""
+        if is_catalogue(lidar):  # whose tiles are listed for the pairs that are chosen
+            given["lidar"] = to = f"lidar/{city}.tsv"
+            words = _options([("to", to), ("column", column), *(("allow-host", h) for h in hosts)])
+            then = f" && stereotruth lidar {shlex.quote(lidar)} {city}{words}"
+        return [*lines, *_add_site(images, city, settings, _options(given.items()) + then)]
     pair = images[0], images[1]
     _refuse_repeated(pair, scenes, rows)
     numbered = (f"{re.sub(r'[^A-Za-z0-9-]', '-', city)}-{k}" for k in range(1, 10_000))
@@ -227,10 +232,8 @@ def add_scene(
     return lines
 
 
-def _add_site(
-    images: Sequence[Image], city: str, settings: Configuration, given: Mapping[str, str]
-) -> list[str]:
-    """List those images of a site that are new; the next step has the options ``given``."""
+def _add_site(images: Sequence[Image], city: str, settings: Configuration, rest: str) -> list[str]:
+    """List those images of a site that are new; ``rest``: how the command that is next ends."""
     if not settings.images:
         remedy = "add images: images.tsv, a file with the columns image, city, file"
         raise InputError("the configuration names no images sheet", remedy=remedy)
@@ -238,16 +241,23 @@ def _add_site(
     listed = {sheets.file_key(image.file) for image in known.values()}
     paths = [one.path for one in images if sheets.file_key(str(one.path)) not in listed]
     lines = _add_city(city, cities, Path(sheet(settings, "cities")))
+    taken = set(known)
     for name, path in sheets.store_names(paths).items():
-        row = {"image": re.sub(r"[^A-Za-z0-9_-]", "-", name), "city": city, "file": path}
-        append_row(Path(settings.images), row)
+        name = re.sub(r"[^A-Za-z0-9_-]", "-", name)
+        names = (name, *(f"{name[: sheets.LONGEST_NAME - 5]}-{k}" for k in range(2, 1000)))
+        taken.add(name := next(one for one in names if one not in taken))
+        append_row(Path(settings.images), {"image": name, "city": city, "file": path})
     smaller = _smaller_tiles(min(min(image.size) for image in images), settings)
-    words = "".join(f" --{key} {shlex.quote(text)}" for key, text in given.items() if text)
     lines.append(
         f"{settings.images}: {len(paths)} images of {city}. "
-        f"Next: {smaller}stereotruth pairs {city} --most 1{words}"
+        f"Next: {smaller}stereotruth pairs {city} --most 1{rest}"
     )
     return lines
+
+
+def _options(given: Iterable[tuple[str, str]]) -> str:
+    """Options of a command, as a shell reads them; those without a value are left out."""
+    return "".join(f" --{key} {shlex.quote(text)}" for key, text in given if text)
 
 
 def _smaller_tiles(side: int, settings: Configuration) -> str:

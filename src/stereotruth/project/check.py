@@ -124,7 +124,8 @@ def check_project(
         every.insert(1, of_images)
     run = Findings("run")
     with run.of("resources"):
-        check_resources([fact for fact in facts if fact.pixels], run)
+        others = cities.keys() - {scene.city for scene in scenes.values()}
+        check_resources([fact for fact in facts if fact.pixels], run, others)
     return [*every, run]
 
 

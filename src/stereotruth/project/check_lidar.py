@@ -162,14 +162,18 @@ def _off_at_gcps(
 
 
 def _off_by_rpcs(files: Sequence[SurveyedFile], alignment: Alignment, undulation_m: float) -> str:
-    """Whether the RPCs' heights are those of the files without twice the undulation."""
-    middle = np.median([np.mean(file.heights) for file in files])
+    """Whether the RPCs' heights are those of the files without twice the undulation.
+
+    None of the files' heights may be near those of the RPCs: a bird is far above all others.
+    """
+    lowest, highest = zip(*(file.heights for file in files))
+    bottom, top = min(lowest), max(highest)
     for sensor in (alignment.left, alignment.right):
         low, high = sensor.rpc.ground_box[4:]
         spare = (high - low) / 4
-        if high - low > abs(undulation_m) or low - spare <= middle <= high + spare:
+        if high - low > abs(undulation_m) or (bottom <= high + spare and top >= low - spare):
             return ""
-        if not low <= middle - 2 * undulation_m <= high:
+        if not (bottom - 2 * undulation_m <= high and low <= top - 2 * undulation_m):
             return ""
     return f"by the RPCs' heights of {low:.0f} to {high:.0f} m"
 

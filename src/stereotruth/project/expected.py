@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -263,8 +263,11 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h"
 
 
-def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
-    """Say what a run from nothing takes, and refuse a disk that is too small for it."""
+def check_resources(
+    facts: Sequence[SceneFacts], found: Findings, others: Collection[str] = ()
+) -> None:
+    """Say what a run from nothing takes, and refuse a disk that is too small for it, or on which
+    it cannot write. ``others``: cities that it makes nothing of."""
     if not facts:
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -280,7 +283,7 @@ def check_resources(facts: Sequence[SceneFacts], found: Findings) -> None:
         f"about {duration(seconds / max(cores or 1, 1))}{compiling} on the {cores} cores of this "
         "machine, from nothing to tiles",
     )
-    for path in locked_folders():
+    for path in locked_folders(others):
         found.fault(
             "disk",
             f"{path}: nothing can be written there",
@@ -311,11 +314,13 @@ def is_compiled() -> bool:
     return any((folder() / sources_digest(COMPILED_LAST)).rglob("*.nbc"))
 
 
-def locked_folders() -> list[Path]:
+def locked_folders(others: Collection[str] = ()) -> list[Path]:
     """Folders of the products of a run in which nothing can be written: those that are there, with
-    the ones in them that products lie in, else the nearest above."""
+    the ones in them that products lie in, else the nearest above. Not those of ``others``, cities
+    that nothing is made of."""
     found = {top if top.is_dir() else Path() for top in map(Path, WRITTEN)}
     found |= {path for top in NESTED for end in ("*", "*/*") for path in Path(top).glob(end)}
+    found = {path for path in found if path.name not in others}
     folders = (path for path in found if path.is_dir() and not path.suffix)
     return sorted(path for path in folders if not os.access(path, os.W_OK | os.X_OK))
 

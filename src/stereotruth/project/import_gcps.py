@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -107,7 +108,8 @@ def import_gcps(
     geoid = geoid or said.get("geoid")
     if heights is not None and heights.suffix.lower() in TABLES:
         placed = to_itrf(points, crs, None, files[0], epoch, places_only=True)
-        points, raster = with_heights(points, _in_own_frame(*placed[:2]), heights), None
+        points, of_table = with_heights(points, _in_own_frame(*placed[:2]), heights)
+        geoid, raster = geoid or of_table, None
     points, transform, notes = to_itrf(points, crs, geoid, files[0], epoch)
     if raster is not None and (without := [p for p in points if math.isnan(p.height)]):
         grid = None if geoid == NO_GEOID else geoid
@@ -429,7 +431,7 @@ def _views_of(file: Path, images: list[str], left: str, right: str) -> dict[str,
 # -------------------------------------------------------------------------------------------- CSV
 
 
-def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, str], list[str]]:
+def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, Any], list[str]]:
     """A table with a header, of any of the names and separators that are common; its system."""
     expected = f"call the columns {','.join(COLUMNS)}"
     table = Table.read(file, expected, ragged=True)
@@ -447,16 +449,22 @@ def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, str], li
         pixels = ((value[f"{v}_col"], value[f"{v}_row"]) for v in ("left", "right"))
         ground = value["lon"], value["lat"], value.get("height", math.nan)
         points.append(Point(cells[called["id"]], *ground, *pixels))
-    said = _declared(table, crs)
-    if called.get("height") == "ellipsoidal_height":
-        said["geoid"] = NO_GEOID
+    said = _declared(table, crs) | {"geoid": _geoid_of(called)}
     return points, said, [f"{len(points)} points of {file.name}"]
 
 
-def with_heights(points: Sequence[Point], ground: Sequence[Point], source: Path) -> list[Point]:
+def _geoid_of(called: Mapping[str, str]) -> Path | None:
+    """NO_GEOID, if the column of heights says that they count from the ellipsoid."""
+    return NO_GEOID if called.get("height") == "ellipsoidal_height" else None
+
+
+def with_heights(
+    points: Sequence[Point], ground: Sequence[Point], source: Path
+) -> tuple[list[Point], Path | None]:
     """Points with heights of a table, by id, or by longitude and latitude (those of ``ground``).
 
-    Heights are in the points' own system. Points that have one keep it.
+    Heights are in the points' own system. Points that have one keep it. Also NO_GEOID, if the table
+    says that all heights count from the ellipsoid.
     """
     expected = "write id,height or lon,lat,height"
     table = Table.read(source, expected, ragged=True)
@@ -483,4 +491,5 @@ def with_heights(points: Sequence[Point], ground: Sequence[Point], source: Path)
         if math.isnan(height) and at:
             height = height_at.get(_same_place(at, place.x, place.y), math.nan)
         found.append(replace(point, height=height))
-    return found
+    own = any(not math.isnan(point.height) for point in points)
+    return found, None if own else _geoid_of(called)

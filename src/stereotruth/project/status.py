@@ -101,17 +101,21 @@ def plan(targets: Sequence[str], configfiles: Sequence[Path] | None = None) -> l
 class CityStatus:
     """A city's tiles and pages, or what is made of all cities together, and what a run would do.
 
-    Of tiles, pages and the figures of `evaluate`, and of all else that was ever made.
+    Of tiles, pages and the figures of `evaluate`, and of all else that was ever made. ``refused``:
+    why there is no plan of it.
     """
 
     city: str
     made: str
     pages: tuple[str, ...]
     jobs: tuple[PlannedJob, ...]
+    refused: str = ""
 
     @property
     def state(self) -> str:
         """Of the tiles, in a few words."""
+        if self.refused:
+            return "no plan"
         if all(job.rule in AFTER_TILES for job in self.jobs):
             return "up to date"
         return "out of date" if self.made else "not made"
@@ -121,6 +125,8 @@ class CityStatus:
 
         Figures and pages that were never made of tiles that are up to date are nothing to do.
         """
+        if self.refused:
+            return [self.refused]
         jobs = sorted(self.jobs, key=lambda job: job.rule in AFTER_TILES)
         if self.state == "up to date":
             jobs = [job for job in jobs if MISSING not in job.reason]
@@ -224,7 +230,13 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
     targets = [target.format(city) for city in wanted for target in of_city]
     of_cities, of_all = _made_before(settings, known, found)
     of_all = [] if cities else of_all
-    jobs = plan([*targets, *of_cities, *of_all, "evaluate"], configfiles)
+    refused = ""
+    try:
+        jobs = plan([*targets, *of_cities, *of_all, "evaluate"], configfiles)
+    except InputError as error:  # of a dataset that is no more, say: tiles have a plan all the same
+        if not (of_cities or of_all):
+            raise
+        jobs, refused = plan([*targets, "evaluate"], configfiles), error.problem
     pages = [page for pattern in PAGES for page in Path().glob(pattern)]
     every = [
         CityStatus(
@@ -235,9 +247,10 @@ def status_of(cities: Sequence[str], configfiles: Sequence[Path] | None) -> list
         )
         for city in wanted
     ]
-    if of_all:
+    if of_all or refused:
         together = tuple(job for job in jobs if not job.city and job.rule != "evaluate")
-        every.append(CityStatus(OF_ALL, ", ".join(of_all), (), together))
+        made = ", ".join([*of_cities, *of_all] if refused else of_all)
+        every.append(CityStatus(OF_ALL, made, (), together, refused))
     return every
 
 

@@ -268,6 +268,9 @@ def test_what_a_copy_states_of_its_labels_is_that_of_its_files(kind, tiles, tmp_
         is_, was = (json.loads((folder / "export.json").read_text()) for folder in (out, right))
         assert is_["disparity_px"] == was["disparity_px"] and "label_uncertainty" not in is_
         assert is_["quality"]["flagged_tiles"] == was["quality"]["flagged_tiles"]
+        later = written(tmp_path / "later", out / row["disp"], shift)
+        assert apply_errata(later, out, tmp_path / "again") == 1  # of a copy that was corrected
+        assert defects(tmp_path / "again") == []
 
 
 def test_kitti_files_stay_such(tmp_path):

@@ -72,6 +72,9 @@ def test_files_of_functions_commands_and_entry_points(monkeypatch):
         "a, match = 0, 1",
         "from pack import other as match",
         "from pack import *",
+        "from pack import *  # noqa: F403",
+        "from pack import *; a = 0",
+        "def __getattr__(name): return len",
         "globals()['mat' + 'ch'] = 0",
     ],
 )
@@ -87,6 +90,12 @@ def test_a_function_or_program_that_is_not_there_is_refused():
     assert "matching" in refused.value.remedy
     with pytest.raises(InputError):
         KINDS["command"].files({"command": "no_such_program {left} {right} {out}"})
+
+
+def test_a_program_of_this_folder_is_found():
+    Path("own").write_text("#!/bin/sh\n")
+    Path("own").chmod(0o755)
+    assert KINDS["command"].files({"command": "./own {left} {right} {out}"}) == [Path("own")]
 
 
 def test_files_are_named_below_the_folder_that_they_share(here):

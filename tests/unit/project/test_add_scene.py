@@ -109,6 +109,18 @@ def test_a_sites_images_are_listed_and_the_command_said_last_chooses_a_pair(fold
     assert list(read_rows(configured()[0])[1]) == [row()["scene"]]
 
 
+def test_images_of_a_site_get_names_that_no_other_has(folder, monkeypatch):
+    images = [*copied(folder, "a", "c-1"), folder / "named/c.1.tif"]
+    shutil.copy(images[0], images[2])
+    shutil.copytree(folder / "named", folder / "other")
+    begin(folder / "site")
+    monkeypatch.chdir(folder / "site")
+    for k, name in enumerate(("named", "other"), 1):
+        add_scene([Path("..", name)], lidar="../lidar", city=f"Site{k}")
+    names = ["a", "c-1", "c-1-2", "a-2", "c-1-3", "c-1-4"]
+    assert list(read_rows(configured()[0])[2]) == names
+
+
 def test_images_that_are_named_keep_their_order(folder):
     first, second = copied(folder, "a", "b")
     lines = add_scene([second, first], lidar="lidar", city="Good")

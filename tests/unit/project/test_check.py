@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 import rasterio
@@ -79,6 +80,27 @@ def test_without_control_points_the_rpcs_tell_a_geoid_of_the_other_sign(folder):
     geoid_of_other_sign(folder, 100.0)
     assert not any("with this geoid" in text for text in _without_gcps(height_scale=500.0))
     assert any("RPCs' heights of 15 to 105 m" in text for text in _without_gcps(height_scale=45.0))
+
+
+def test_a_protected_city_is_no_error_of_another(folder, monkeypatch):
+    with Path("cities.tsv").open("a") as sheet:
+        sheet.write("Done\tDO\t1\t1\t1\n")
+    locked = Path("results/align/Done")
+    locked.mkdir(parents=True)
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != locked)
+    assert texts(Level.ERROR) == []
+    locked = Path("results/align/Good")
+    locked.mkdir()
+    assert len(texts(Level.ERROR)) == 1
+
+
+def test_a_bird_high_above_the_ground_is_no_geoid_of_the_other_sign(folder):
+    geoid_of_other_sign(folder, 100.0)
+    write_gtx(folder / "geoid.gtx", np.full((5, 5), 100.0), 113.0, 28.0, 1.0)
+    points = laspy.read(folder / "lidar" / "points.laz")
+    points.z = [300.0, *points.z[1:]]
+    points.write(folder / "lidar" / "points.laz")
+    assert _without_gcps(height_scale=45.0) == []
 
 
 def _without_gcps(height_scale: float) -> list[str]:

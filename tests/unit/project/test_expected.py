@@ -47,6 +47,7 @@ def test_folders_that_a_run_cannot_write_to_are_errors(monkeypatch, tmp_path):
     locked = {"results/align/City", "tiles"}
     monkeypatch.setattr("os.access", lambda path, mode: str(path) not in locked)
     assert expected.locked_folders() == [Path("results/align/City"), Path("tiles")]
+    assert expected.locked_folders({"City"}) == [Path("tiles")]
     assert said("disk").startswith("error: results/align/City")
     monkeypatch.setattr("os.access", lambda path, mode: str(path) != ".")
     assert expected.locked_folders() == [Path()]  # where logs and .snakemake would be made

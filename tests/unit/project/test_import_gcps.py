@@ -209,6 +209,23 @@ def test_stated_heights_of_a_national_plane_system(tmp_path, crs, column, how, l
     assert height == pytest.approx(35.0 + lifted, abs=1e-3)
 
 
+def test_a_table_of_heights_says_what_they_count_from(tmp_path):
+    for view in ("left", "right"):
+        (tmp_path / f"{view}.points").write_text(
+            "mapX,mapY,sourceX,sourceY,enable\n652000,6862000,10,-10,1\n"
+        )
+    files, out = [tmp_path / f"{view}.points" for view in ("left", "right")], tmp_path / "out.csv"
+    for column in ("height", "ellipsoidal_height"):
+        heights = tmp_path / f"{column}.csv"
+        heights.write_text(f"id,{column}\nG01,35\n")
+        if column == "height":
+            with pytest.raises(InputError):
+                import_gcps(files, out, crs="EPSG:2154", heights=heights)
+        else:
+            import_gcps(files, out, crs="EPSG:2154", heights=heights)
+    assert float(out.read_text().splitlines()[-1].split(",")[3]) == pytest.approx(35.0, abs=1e-3)
+
+
 SEATTLE = (-122.3, 47.6)
 HEAD = "id,lon,lat,height,left_col,left_row,right_col,right_row\n"
 

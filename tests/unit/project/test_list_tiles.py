@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -14,6 +15,7 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+from typer.testing import CliRunner
 
 from stereotruth.core.errors import InputError
 from stereotruth.lidar.catalogue_list import read_list
@@ -21,7 +23,9 @@ from stereotruth.lidar.ingest import ingest
 from stereotruth.project.add_scene import add_scene
 from stereotruth.project.check import check_project
 from stereotruth.project.list_tiles import list_of_scenes
-from stereotruth.project.project import configured, lidar_of, read_scenes
+from stereotruth.project.main import app
+from stereotruth.project.new_project import begin
+from stereotruth.project.project import configured, lidar_of, read_rows, read_scenes
 
 from ...synthetic.broken_scenes import write_sheet
 
@@ -219,6 +223,21 @@ def test_a_column_of_an_index_may_be_named_for_a_scene(folder):
         add_with(folder, name)
     add_with(folder, name, column="url", lidar_crs=SYSTEM)
     assert all(tile.file.startswith("tiles/") for tile in read_list("lidar/Good-2.tsv").tiles)
+
+
+def test_a_site_is_added_with_a_catalogue(folder, monkeypatch):
+    """By the two commands that are said last: the rows of the pairs, then the tiles of these."""
+    (folder / "named").mkdir()
+    for name, view in (("a", "left"), ("b", "right"), ("c", "left")):
+        (folder / f"named/{name}.tif").write_bytes((folder / f"{view}.tif").read_bytes())
+    begin(folder / "site")
+    monkeypatch.chdir(folder / "site")
+    name = f"../{catalogue(folder, items_of(folder))}"
+    lines = add_scene([Path("../named")], lidar=name, city="Site")
+    for command in lines[-1].partition("Next: ")[2].split(" && "):
+        assert CliRunner().invoke(app, shlex.split(command)[1:]).exit_code == 0
+    ((_, row),) = read_rows(configured()[0])[1].items()
+    assert row.lidar == "lidar/Site.tsv" and len(read_list(row.lidar).tiles)
 
 
 class Site:

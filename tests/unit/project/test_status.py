@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
+from stereotruth.core.errors import InputError
 from stereotruth.project import status
 from stereotruth.project.status import CityStatus, PlannedJob, status_of
 
@@ -70,3 +73,22 @@ def test_what_was_ever_made_is_planned_and_what_is_no_more_is_not(folder, monkey
     assert good.why()[0] == "originals 1" and together.why()[0] == "score 1"
     asked.clear()
     assert len(status_of(["Good"], [Path("config.yaml")])) == 1 and "dataset" not in asked
+
+
+def test_tiles_have_a_status_where_what_else_was_made_has_no_plan(folder, monkeypatch):
+    """As a benchmark whose dataset lies on a disk that is not there."""
+    Path("benchmark/synthetic/sgm").mkdir(parents=True)
+
+    def plan(targets, files):
+        if len(targets) > 3:
+            raise InputError("no such folder", remedy="name it")
+        return [PlannedJob("align", "Good", "", PARAMS)]
+
+    monkeypatch.setattr(status, "plan", plan)
+    good, together = status_of([], [Path("config.yaml")])
+    assert good.why()[0] == "align 1" and (good.state, together.state) == ("not made", "no plan")
+    assert together.made == "benchmark/synthetic/sgm" and together.why() == ["no such folder"]
+    Path("benchmark/synthetic/sgm").rmdir()
+    monkeypatch.setattr(status, "plan", lambda targets, files: plan("abcd", files))
+    with pytest.raises(InputError):
+        status_of([], [Path("config.yaml")])
