@@ -215,7 +215,7 @@ def in_counts(counts: Mapping[str, int]) -> str:
 def reach_of(labelled: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     """Least and greatest disparity of rows of a manifest that have labels."""
     ends = [(row["disparity_min_px"], row["disparity_max_px"]) for row in labelled]
-    low, high = zip(*((float(a), float(b)) for a, b in ends if a))
+    low, high = zip(*((float(a), float(b)) for a, b in ends if a != ""))
     return {"min": min(low), "max": max(high)}
 
 

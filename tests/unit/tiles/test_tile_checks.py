@@ -12,7 +12,7 @@ from stereotruth.core.config.configuration import Limits
 from stereotruth.core.errors import InputError
 from stereotruth.tiles import label_doubts
 from stereotruth.tiles.manifest import tells_of_change
-from stereotruth.tiles.tile_checks import misfit_lines, summary_lines
+from stereotruth.tiles.tile_checks import misfit_lines, reach_of, summary_lines
 from stereotruth.tiles.verify import defects
 
 from ...synthetic.tiled_scene import (
@@ -148,3 +148,9 @@ def test_what_cannot_have_changed_does_not_fit_the_images():
         assert tells_of_change(row | more) and misfit_lines([row | more]) == []
     assert misfit_lines([row | {"count_changed": "3"}]) == []
     assert misfit_lines([row | {"complete": "no"}]) == []
+
+
+def test_a_disparity_of_zero_is_one() -> None:
+    rows = [{"disparity_min_px": 0.0, "disparity_max_px": 3.5}]
+    blank = {"disparity_min_px": "", "disparity_max_px": ""}
+    assert reach_of([*rows, blank]) == {"min": 0.0, "max": 3.5}
