@@ -212,11 +212,12 @@ def in_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 
-def reach_of(labelled: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """Least and greatest disparity of rows of a manifest that have labels."""
-    ends = [(row["disparity_min_px"], row["disparity_max_px"]) for row in labelled]
-    low, high = zip(*((float(a), float(b)) for a, b in ends if a != ""))
-    return {"min": min(low), "max": max(high)}
+def reach_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, float | None]:
+    """Least and greatest disparity of rows of a manifest; None if none of them has labels."""
+    labelled = [row for row in rows if row["disparity_min_px"] != ""]
+    low = [float(row["disparity_min_px"]) for row in labelled]
+    high = [float(row["disparity_max_px"]) for row in labelled]
+    return {"min": min(low, default=None), "max": max(high, default=None)}
 
 
 def flagged(labelled: Iterable[Mapping[str, Any]]) -> dict[str, str]:

@@ -154,3 +154,4 @@ def test_a_disparity_of_zero_is_one() -> None:
     rows = [{"disparity_min_px": 0.0, "disparity_max_px": 3.5}]
     blank = {"disparity_min_px": "", "disparity_max_px": ""}
     assert reach_of([*rows, blank]) == {"min": 0.0, "max": 3.5}
+    assert reach_of([blank]) == {"min": None, "max": None}

@@ -181,15 +181,12 @@ def _images_table(images: Sequence[SiteImage], files: Mapping[str, str | Path]) 
         cols, lines = image.size
         middle = (cols - 1) / 2, (lines - 1) / 2, float(image.sensor.rpc.height_off)
         upwards = float(ray_upwards(image.sensor, *middle)[2])
-        grey = read_overview(files[image.name], LOOK_PX)
-        picture = encode(stretch(grey), LOOK_BYTES)
+        picture = encode(stretch(read_overview(files[image.name], LOOK_PX)), LOOK_BYTES)
         looks.append(Cell(f"picture of {image.name}", "", pictures=(picture,)))
-        bits = int(grey.max()).bit_length() if grey.dtype.kind == "u" else ""
         rows.append(
             {
                 "image": image.name,
                 "acquired (UTC)": _acquired(image),
-                "bits of the greys": str(bits),
                 "off_nadir_degrees": f"{math.degrees(math.acos(min(upwards, 1.0))):.1f}",
                 "sun_azimuth_degrees": _number(image.sun and image.sun[0], ".1f"),
                 "sun_elevation_degrees": _number(image.sun and image.sun[1], ".1f"),

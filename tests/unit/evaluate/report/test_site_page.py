@@ -72,9 +72,8 @@ def test_residuals_and_closure_are_shown_as_they_are(tmp_path):
     assert "&lt;b&gt;" in text and "<b>" not in text.partition("</header>")[2]
     (first, _, last) = cells(text, "images")
     assert first[1] == "A" and first[2] == f"{A.time:%Y-%m-%d %H:%M}"
-    assert first[3] == "16"  # of values up to 63999
-    assert first[5:] == [f"{angle:.1f}" for angle in A.sun] and last[2:] != first[2:]
-    assert last[2] == last[5] == ""
+    assert first[4:] == [f"{angle:.1f}" for angle in A.sun] and last[2:] != first[2:]
+    assert last[2] == last[4] == ""
     data = base64.b64decode(re.search(r"base64,([^\"]*)", first[0])[1])
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     assert picture.shape == (100, 160)
