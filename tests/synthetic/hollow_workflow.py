@@ -84,7 +84,7 @@ def make_hollow(folder: Path) -> Project:
     for name in GIVEN:
         (folder / "in" / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / "in" / name).write_text(f"{name}\n")
-    (folder / "mine.py").write_text("import helper\n")
+    (folder / "mine.py").write_text("import helper\n\nmatch = helper\n")
     (folder / "helper.py").write_text("")
     (folder / "geoid.tif").write_text("geoid\n")
     synthetic = "data/synthetic/Wuhan/Wuhan-1"

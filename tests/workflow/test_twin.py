@@ -15,7 +15,7 @@ from ..synthetic import house_points as place
 def test_labels_of_a_twin_are_judged_by_its_truth(project, tmp_path) -> None:
     file = place.write_place(tmp_path / "house.laz")
     with_twin(tmp_path / "twin", file, Options(density=6.0))
-    for made in ("data", "scenes.tsv", "cities.tsv", "config.yaml"):
+    for made in ("data", "scenes.tsv", "cities.tsv", "images.tsv", "config.yaml"):
         (tmp_path / "twin" / made).rename(project.folder / made)
     config = project.folder / "config.yaml"
     config.write_text(config.read_text().replace("size: 128", "size: 96"))

@@ -265,14 +265,15 @@ def fits(shift_m: float, lon: float, lat: float) -> str:
     candidates = candidates_at(lon, lat)
     if not candidates:
         return ""
-    parts = [f"ellipsoidal {abs(shift_m):.1f} m"]
+    parts = [f"by {abs(shift_m):.1f} m if they are ellipsoidal"]
     for one in candidates:
         if one.path is None:
             continue
         with suppress(InputError):  # of a grid that has no value there
             undulation_m = float(GeoidGrid(one.path)(np.array([lon]), np.array([lat]))[0])
-            parts.append(f"{one.surface} ({one.grid}) {abs(shift_m + undulation_m):.1f} m")
-    text = f"no surface is declared for its heights; off by, if they are {'; '.join(parts)}"
+            off_m = abs(shift_m + undulation_m)
+            parts.append(f"by {off_m:.1f} m if they are above {one.surface} ({one.grid})")
+    text = f"no surface is declared for its heights: the LiDAR is off {', '.join(parts)}"
     if missing := [one for one in candidates if one.path is None]:
         text += f"; of the place as well: {named(missing)}"
     return text

@@ -122,8 +122,8 @@ def check_geoid(
             f"{scene.geoid}: with this geoid the LiDAR lies {2 * abs(undulation_m):.1f} m too "
             f"{'high' if undulation_m > 0 else 'low'}, {told}: twice its undulation of "
             f"{undulation_m:+.1f} m, whose sign is wrong",
-            "heights above the ellipsoid are H + N: give a geoid grid whose values here are about "
-            f"{-undulation_m:+.1f} m",
+            "heights above the ellipsoid are H + N: the values of this grid here should be about "
+            f"{-undulation_m:+.1f} m" + (", or the GCPs have heights of H - N" if gcps else ""),
         )
     return bool(told)
 

@@ -433,7 +433,8 @@ def _views_of(file: Path, images: list[str], left: str, right: str) -> dict[str,
 
 def from_csv(file: Path, crs: str = "") -> tuple[list[Point], dict[str, Any], list[str]]:
     """A table with a header, of any of the names and separators that are common; its system."""
-    expected = f"call the columns {','.join(COLUMNS)}"
+    names = ({"lon": "x", "lat": "y"}.get(name, name) if crs else name for name in COLUMNS)
+    expected = f"call the columns {','.join(names)}"
     table = Table.read(file, expected, ragged=True)
     called = _called(table.columns, COLUMNS)
     missing = [column for column in COLUMNS if column not in called and column != "height"]

@@ -100,8 +100,8 @@ def test_orthometric_heights_taken_as_ellipsoidal_fit_their_geoid(tmp_path, inst
     stores[0].attrs["crs"]["heights"] = "ellipsoidal (assumed), in metre"
     text = doubt_at_gcps(survey(), stores, PIXEL)
     assert text.startswith(declared)
-    assert "if they are ellipsoidal 49.4 m; EGM2008 height (us_nga_egm08_25.tif) 0.0 m" in text
-    assert "EGM96 height (us_nga_egm96_15.tif) 4.4 m" in text
+    assert "by 49.4 m if they are ellipsoidal, by 0.0 m if they are above EGM2008 height" in text
+    assert "by 4.4 m if they are above EGM96 height (us_nga_egm96_15.tif)" in text
 
 
 def test_control_points_beside_the_lidar_say_nothing(tmp_path):

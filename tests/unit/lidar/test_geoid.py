@@ -94,7 +94,8 @@ def test_the_geoids_of_a_place(place, surface, grid):
 
 def test_grids_that_are_not_here_are_named_only():
     text = fits(-48.0, 5.4, 43.3)
-    assert "ellipsoidal 48.0 m; of the place as well: NGF-IGN69 height (fr_ign_RAF20.tif" in text
+    assert "by 48.0 m if they are ellipsoidal; of the place as well: NGF-IGN69 height" in text
+    assert "fr_ign_RAF20.tif" in text
 
 
 def test_a_register_that_cannot_be_read_gives_no_names(monkeypatch):
