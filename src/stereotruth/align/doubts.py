@@ -206,6 +206,21 @@ def _constants(shifts: Floats) -> Floats:
     return parameters
 
 
+def lift_by_rpcs(alignment: Alignment) -> tuple[float, float]:
+    """How many m the control points lie too low for the RPCs alone, with its standard uncertainty.
+
+    Of the four mean residuals of both images one combination looks like heights; the other three
+    say how far these RPCs are off. Each view has control points.
+    """
+    look = lines_of_sight(alignment).ravel()
+    residuals = [[g.before for g in fit.gcps if g.used] for fit in alignment.fits]
+    moved = np.concatenate([np.mean(of_view, axis=0) for of_view in residuals])
+    length = np.linalg.norm(look)
+    amount = float(look @ moved / length)
+    others = float(np.linalg.norm(moved - amount * look / length))
+    return amount / float(length), others / float(length) / np.sqrt(3.0)
+
+
 def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
     """The fault of height that tie points and prior would agree with, by generalised least squares.
 

@@ -14,7 +14,14 @@ from typing import Any
 import numpy as np
 
 from ..align.alignment import Alignment, GcpResidual
-from ..align.doubts import FEWEST_GCPS, WIDEST_M, agreeing, control_points_of, off_at_gcps
+from ..align.doubts import (
+    FEWEST_GCPS,
+    WIDEST_M,
+    agreeing,
+    control_points_of,
+    lift_by_rpcs,
+    off_at_gcps,
+)
 from ..core.errors import InputError, in_number, in_words
 from ..core.job import in_own_process
 from ..core.products.remote_files import url_of
@@ -125,7 +132,25 @@ def check_geoid(
             "heights above the ellipsoid are H + N: the values of this grid here should be about "
             f"{-undulation_m:+.1f} m" + (", or the GCPs have heights of H - N" if gcps else ""),
         )
+    elif gcps and all(any(g.used for g in fit.gcps) for fit in alignment.fits):
+        _hold_gcps_against_rpcs(alignment, scene, undulation_m, found)
     return bool(told)
+
+
+def _hold_gcps_against_rpcs(
+    alignment: Alignment, scene: Scene, undulation_m: float, found: Findings
+) -> None:
+    """A doubt if the RPCs alone see the control points twice the undulation off: the LiDAR agrees
+    with them, so its heights are as wrong."""
+    lift_m, sigma_m = lift_by_rpcs(alignment)
+    if 2 * abs(lift_m + 2 * undulation_m) < abs(undulation_m) > CLEAR * sigma_m:
+        found.doubt(
+            "heights",
+            f"{scene.gcps}: by the RPCs alone the GCPs lie {abs(lift_m):.0f} ± {sigma_m:.0f} m too "
+            f"{'low' if lift_m > 0 else 'high'}, and the LiDAR with them: about twice the "
+            f"undulation of {undulation_m:+.1f} m of {scene.geoid}",
+            "heights above the ellipsoid are H + N: look at the sign of the geoid grids of both",
+        )
 
 
 def _off_at_gcps(

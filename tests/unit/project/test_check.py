@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from ...synthetic.broken_scenes import (
 )
 from ...synthetic.las import write_gtx
 from ...synthetic.rpc_texts import rpb_text
-from ...synthetic.surveyed_pair import RPCS
+from ...synthetic.surveyed_pair import RPCS, make_gcps, write_gcps
 
 
 def texts(level: Level) -> list[str]:
@@ -74,6 +75,21 @@ def test_a_geoid_that_is_small_or_right_is_no_error(folder, undulation_m):
     if undulation_m > 5.0:
         write_gtx(folder / "geoid.gtx", np.full((5, 5), undulation_m), 113.0, 28.0, 1.0)
     assert texts(Level.ERROR) == []
+
+
+@pytest.mark.parametrize("are_wrong", [True, False])
+def test_a_geoid_of_the_other_sign_for_lidar_and_control_points_is_a_doubt(folder, are_wrong):
+    """The LiDAR agrees with the control points, but both are 2 N too low for the RPCs."""
+    geoid_of_other_sign(folder, 60.0)
+    if are_wrong:
+        lowered = [row | {"height": row["height"] - 120.0} for row in make_gcps()]
+        write_gcps(folder / "gcps.csv", lowered)
+    else:
+        write_gtx(folder / "geoid.gtx", np.full((5, 5), 60.0), 113.0, 28.0, 1.0)
+    assert not any("geoid.gtx" in text for text in texts(Level.ERROR))
+    said = [text for text in texts(Level.DOUBT) if "twice the undulation" in text]
+    assert len(said) == are_wrong, said
+    assert all(90 < float(re.search(r"lie (\d+)", text)[1]) < 150 for text in said)  # biased RPCs
 
 
 def test_without_control_points_the_rpcs_tell_a_geoid_of_the_other_sign(folder):
