@@ -207,18 +207,24 @@ def _constants(shifts: Floats) -> Floats:
 
 
 def lift_by_rpcs(alignment: Alignment) -> tuple[float, float]:
-    """How many m the control points lie too low for the RPCs alone, with its standard uncertainty.
-
-    Of the four mean residuals of both images one combination looks like heights; the other three
-    say how far these RPCs are off. Each view has control points.
-    """
-    look = lines_of_sight(alignment).ravel()
+    """How many m the control points lie too low for the RPCs alone, with its standard uncertainty,
+    by the means of their residuals. Each view has control points."""
     residuals = [[g.before for g in fit.gcps if g.used] for fit in alignment.fits]
     moved = np.concatenate([np.mean(of_view, axis=0) for of_view in residuals])
-    length = np.linalg.norm(look)
-    amount = float(look @ moved / length)
-    others = float(np.linalg.norm(moved - amount * look / length))
-    return amount / float(length), others / float(length) / np.sqrt(3.0)
+    return _as_height(lines_of_sight(alignment).ravel(), moved, np.zeros((4, 4)))
+
+
+def _as_height(look: Floats, moved: Floats, covariance: Floats) -> tuple[float, float]:
+    """The height m by which both images would move as they did, and its standard uncertainty.
+
+    Of the four shifts ``moved`` px (two each, with a ``covariance`` px²), one combination looks
+    like a height: ``look``, px by m. The other three say how far these RPCs are off.
+    """
+    length = float(np.linalg.norm(look))
+    along = look / length
+    others = np.eye(4) - np.outer(along, along)
+    square = float(np.sum((others @ moved) ** 2) + np.trace(others @ covariance @ others))
+    return float(along @ moved) / length, float(np.sqrt(square / 3)) / length
 
 
 def height_by_images(alignment: Alignment, found: Estimate) -> HeightOffset:
@@ -255,13 +261,8 @@ def chance_of_contradiction(alignment: Alignment, found: Estimate) -> float:
 
 
 def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) -> HeightOffset:
-    """The same where nothing is known but that RPC errors have no preferred direction.
-
-    Of the four shifts of both images (two each), one combination looks like a fault of heights;
-    the other three, with what is not known of them, say how far these RPCs are off: Student's t.
-    """
-    look = lines_of_sight(alignment)
-    length = float(np.linalg.norm(look))
+    """The same where nothing is known but that RPC errors have no preferred direction: Student's t,
+    since three combinations of the shifts say how far these RPCs are off."""
     shifts, covariance = [], np.zeros((4, 12))
     for k, (before, after) in enumerate(zip(alignment.fits, refined.fits)):
         middle = (np.array(after.size) - 1) / 2
@@ -269,13 +270,10 @@ def height_by_rpcs(alignment: Alignment, refined: Alignment, found: Estimate) ->
         shifts.append(middle - before.affine @ (*rpc, 1.0))
         covariance[2 * k : 2 * k + 2, 6 * k : 6 * k + 6] = after.design(*middle)
     covariance = covariance @ found.covariance @ covariance.T
-    along = -look.ravel() / length
-    moved = np.concatenate(shifts)
-    amount = float(along @ moved)
-    others = np.eye(4) - np.outer(along, along)
-    square = float(np.sum((others @ moved) ** 2) + np.trace(others @ covariance @ others))
-    sigma = float(np.hypot(np.sqrt(square / 3) / length, LIDAR_SIGMA_M))
-    return HeightOffset(amount / length, sigma, -float(stdtrit(3, CHANCE_OF_RPCS / 2)) * sigma)
+    look = -lines_of_sight(alignment).ravel()
+    offset_m, sigma_m = _as_height(look, np.concatenate(shifts), covariance)
+    sigma_m = float(np.hypot(sigma_m, LIDAR_SIGMA_M))
+    return HeightOffset(offset_m, sigma_m, -float(stdtrit(3, CHANCE_OF_RPCS / 2)) * sigma_m)
 
 
 @dataclass(frozen=True)
